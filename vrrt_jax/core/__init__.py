@@ -1,0 +1,1 @@
+"""The batched expansion kernel that every planner runs on."""

@@ -1,0 +1,163 @@
+"""The data that flows through the kernel.
+
+Letters: ``B`` lanes (32), ``N`` node capacity, ``D`` joints, ``L`` links, ``K`` obstacle slots.
+Joints in [rad] or [m], lengths in [m], quaternions wxyz.
+"""
+
+import dataclasses
+import enum
+from typing import Any, Generic, Protocol, TypeVar, dataclass_transform
+
+import jax
+
+Payload = TypeVar("Payload")
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True)
+def pytree(cls):
+    """Make a frozen, keyword-only dataclass whose fields JAX can trace.
+
+    Fields declared with :func:`static` are compile-time constants instead.
+    """
+    cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+    return jax.tree_util.register_dataclass(cls)
+
+
+def static(**kwargs: Any) -> Any:
+    """A dataclass field that is part of the compiled program, not an array."""
+    return dataclasses.field(metadata={"static": True}, **kwargs)
+
+
+class Labels(tuple):
+    """Names carried by a pytree for messages and look-ups on the host.
+
+    Any two compare equal, so that renaming an obstacle never re-traces a function.
+    """
+
+    __slots__ = ()
+
+    def __eq__(self, other: object) -> bool:
+        """Equal to any other labels."""
+        return isinstance(other, Labels)
+
+    def __hash__(self) -> int:
+        """One hash for all labels."""
+        return 0
+
+
+class Rejection(enum.IntEnum):
+    """Why a lane's child did not enter the tree; indexes ``Tree.rejected``."""
+
+    NO_PARENT = 0  # the policy had nothing to expand in this lane
+    LIMITS = 1  # clipped to the joint limits, no step was left
+    BLOCKED = 2  # the edge meets an obstacle or the robot itself
+    NOT_FINITE = 3  # NaN or infinity in the child, its score or its payload
+    CAPACITY = 4  # the tree is full
+
+
+@pytree
+class Tree(Generic[Payload]):
+    """A search tree of fixed capacity; slots at and beyond ``size`` are empty."""
+
+    q: jax.Array  # (N, D) configurations
+    parent: jax.Array  # (N,) i32 index of the parent, -1 for a root and in empty slots
+    cost: jax.Array  # (N,) path length from the root [rad]
+    score: jax.Array  # (N,) lower is better, +inf in empty slots
+    size: jax.Array  # () i32 number of nodes
+    iteration: jax.Array  # () i32 iterations done
+    rejected: jax.Array  # (len(Rejection),) i32 lanes lost, by reason
+    payload: Payload  # leaves (N, ...): what the policy keeps for each node
+
+    @property
+    def capacity(self) -> int:
+        """Number of slots, N."""
+        return self.parent.shape[0]
+
+
+@pytree
+class Proposals:
+    """What a policy wants to try: one child for each lane."""
+
+    parent: jax.Array  # (B,) i32 node to expand
+    target: jax.Array  # (B, D) where to go; the kernel clips it to limits and edge length
+    ok: jax.Array  # (B,) bool, False where the lane has nothing to try
+    partial: jax.Array  # (B,) bool, keep the free part of a blocked edge
+    carry: Any  # leaves (B, ...): handed to ``evaluate`` and ``after_insert``
+
+
+@pytree
+class Expansion:
+    """What became of one iteration's lanes, for ``after_insert``."""
+
+    q: jax.Array  # (B, D) the children
+    slot: jax.Array  # (B,) i32 where each went, N (out of range) if rejected
+    accepted: jax.Array  # (B,) bool
+    free: jax.Array  # (B,) bool, the edge was free (wholly, or partly where allowed)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Obstacle:
+    """An obstacle as the host sees it: one primitive geom of an MJCF file."""
+
+    name: str
+    kind: str  # sphere, box, capsule, cylinder or plane
+    position: tuple[float, float, float]  # in the world [m]
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # wxyz
+    size: tuple[float, float, float] = (0.0, 0.0, 0.0)  # as MuJoCo's geom size [m]
+    rgba: tuple[float, float, float, float] = (0.6, 0.6, 0.65, 1.0)
+
+
+@pytree
+class Spheres:
+    """Collision spheres bound to links."""
+
+    link: jax.Array  # (n,) i32
+    centre: jax.Array  # (n, 3) in the link's frame [m]
+    radius: jax.Array  # (n,) [m]
+
+
+class ExpansionPolicy(Protocol[Payload]):
+    """A planner: a pytree whose arrays are traced, so that a new goal never re-compiles."""
+
+    @property
+    def edge_steps(self) -> int:
+        """S, the number of collision checks along an edge (static)."""
+        ...
+
+    def root(self, world: Any, q: jax.Array) -> tuple[jax.Array, Payload]:
+        """Score () and payload of a root at ``q`` (D,)."""
+        ...
+
+    def propose(self, world: Any, tree: Tree[Payload], key: jax.Array) -> Proposals:
+        """Choose a parent and a target for each of the B lanes."""
+        ...
+
+    def evaluate(
+        self, world: Any, q: jax.Array, proposals: Proposals
+    ) -> tuple[jax.Array, Payload]:
+        """Scores (B,) and payloads (B, ...) of the children ``q`` (B, D)."""
+        ...
+
+    def after_insert(
+        self, world: Any, tree: Tree[Payload], proposals: Proposals, expansion: Expansion
+    ) -> Tree[Payload]:
+        """Book-keeping once the children are in: frontier flags, rewiring."""
+        ...
+
+
+class Status(enum.Enum):
+    """How a plan ended, with what to try next."""
+
+    SOLVED = "a collision-free path whose end matches the goal, checked with C MuJoCo"
+    NO_MATCH = (
+        "no configuration renders like the goal: check the camera and the self-model, "
+        "add a view, or raise max_iterations"
+    )
+    BUDGET = "the iterations ran out: raise max_iterations"
+    TREE_FULL = "the tree is full: raise capacity"
+    TIME_LIMIT = "the time limit passed: raise time_limit_s"
+    INTERRUPTED = "interrupted: the best path so far is returned"
+    NOT_VERIFIED = (
+        "the path touches something under the exact check: lower the resolution or "
+        "raise the collision margin"
+    )

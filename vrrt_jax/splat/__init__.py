@@ -1,0 +1,1 @@
+"""Splat models of robots: pose, camera, rasterizer, loss and training."""

@@ -1,0 +1,126 @@
+"""Cameras: from a point of view to pixels."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax.splat.types import Camera
+
+
+def look_at(
+    eye: Sequence[float],
+    target: Sequence[float],
+    *,
+    fovy_deg: float = 45.0,
+    height: int = 480,
+    width: int = 480,
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+) -> Camera:
+    """Place a camera at ``eye`` that looks at ``target``.
+
+    Args:
+        eye: camera centre in the world [m].
+        target: a point on the optical axis [m].
+        fovy_deg: vertical field of view [degree].
+        height: image height [px].
+        width: image width [px].
+        up: direction that points up in the image.
+
+    Raises:
+        ValueError: the eye is at the target, or the view direction is parallel to ``up``.
+    """
+    eye_, target_, up_ = (np.asarray(v, np.float64) for v in (eye, target, up))
+    forward = target_ - eye_
+    right = np.cross(forward, up_)
+    if np.linalg.norm(right) < 1e-9:
+        raise ValueError(
+            f"camera at {eye_.tolist()} looking at {target_.tolist()}: the view direction is zero "
+            f"or parallel to up={up_.tolist()}; move the eye or choose another up"
+        )
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    world_to_cam = np.eye(4)
+    world_to_cam[:3, :3] = rotation
+    world_to_cam[:3, 3] = -rotation @ eye_
+    focal = 0.5 * height / np.tan(np.radians(fovy_deg) / 2)
+    return Camera(
+        world_to_cam=jnp.asarray(world_to_cam, jnp.float32),
+        focal=jnp.float32(focal),
+        centre=jnp.asarray([width / 2, height / 2], jnp.float32),
+        height=height,
+        width=width,
+    )
+
+
+def orbit(
+    *,
+    azimuth_deg: float,
+    elevation_deg: float,
+    distance: float,
+    target: Sequence[float] = (0.0, 0.0, 0.0),
+    fovy_deg: float = 45.0,
+    height: int = 480,
+    width: int = 480,
+) -> Camera:
+    """Place a camera by angles around ``target``, as MuJoCo's free camera does.
+
+    Args:
+        azimuth_deg: heading of the view direction about z [degree]; at 0 the camera looks along +x.
+        elevation_deg: pitch of the view direction [degree]; negative looks down.
+        distance: from the target [m].
+        target: the point looked at [m].
+        fovy_deg: vertical field of view [degree].
+        height: image height [px].
+        width: image width [px].
+    """
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    forward = np.array(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ]
+    )
+    eye = np.asarray(target, np.float64) - distance * forward
+    return look_at(eye.tolist(), target, fovy_deg=fovy_deg, height=height, width=width)
+
+
+def resized(camera: Camera, height: int, width: int) -> Camera:
+    """The same view with another number of pixels.
+
+    Raises:
+        ValueError: the new size has another aspect ratio.
+    """
+    if height * camera.width != width * camera.height:
+        raise ValueError(
+            f"cannot resize a {camera.width}x{camera.height} camera to {width}x{height}: "
+            "keep the aspect ratio"
+        )
+    scale = height / camera.height
+    return dataclasses.replace(
+        camera,
+        focal=camera.focal * scale,
+        centre=camera.centre * scale,
+        height=height,
+        width=width,
+    )
+
+
+def stack_cameras(cameras: Sequence[Camera]) -> Camera:
+    """Stack V cameras of one size into one whose arrays lead with V."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+
+
+def project(camera: Camera, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Project points (..., 3) to pixels (..., 2) and depths (...) [m].
+
+    Points nearer than 1 cm, or behind the camera, get a pixel that is finite but meaningless: look
+    at the depth.
+    """
+    points_cam = points_world @ camera.world_to_cam[:3, :3].T + camera.world_to_cam[:3, 3]
+    depth = points_cam[..., 2]
+    pixels = camera.focal * points_cam[..., :2] / jnp.maximum(depth, 0.01)[..., None]
+    return pixels + camera.centre, depth
