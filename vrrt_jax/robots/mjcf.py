@@ -1,0 +1,224 @@
+"""Read any MJCF or URDF robot and reduce it to what planning needs."""
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+_JOINT_KINDS = {
+    mujoco.mjtJoint.mjJNT_FREE: "free",
+    mujoco.mjtJoint.mjJNT_BALL: "ball",
+}
+
+
+def read_spec(path: Path) -> mujoco.MjSpec:
+    """Parse an MJCF or URDF file into an editable spec.
+
+    Args:
+        path: an existing file.
+
+    Raises:
+        ValueError: the file is not readable as a robot.
+    """
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ValueError(_unreadable(path, error)) from None
+    # A URDF fuses links without a joint of their own into their parents: their names would be lost.
+    spec.compiler.fusestatic = False
+    for kind, elements in (("body", spec.bodies), ("joint", spec.joints)):
+        for index, element in enumerate(elements):
+            element.name = element.name or f"{kind}_{index}"
+    # Only kinematics is used; a URDF link without <inertial> would not compile.
+    for body in spec.bodies[1:]:
+        body.explicitinertial = True
+        body.mass = 1.0
+        body.fullinertia = [np.nan] * 6
+        body.inertia = [0.01] * 3
+        body.ipos = [0, 0, 0]
+        body.iquat = [1, 0, 0, 0]
+    return spec
+
+
+def compile_spec(spec: mujoco.MjSpec, path: Path | str) -> mujoco.MjModel:
+    """Compile; a failure becomes one line that names the file.
+
+    Raises:
+        ValueError: the model does not compile, for instance because a mesh is missing.
+    """
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise ValueError(_unreadable(path, error)) from None
+
+
+def _unreadable(path: Path | str, error: Exception) -> str:
+    reason = "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
+    return (
+        f"cannot read '{path}' as a robot: {reason}; expected a complete MJCF or URDF file whose "
+        "meshes are where it says"
+    )
+
+
+def strip_spec(spec: mujoco.MjSpec, *, visuals: bool) -> None:
+    """Delete, in place, everything but bodies, joints, keys and geoms.
+
+    Args:
+        spec: as read from the file; keyframes and equalities stay, see :func:`freeze_joints`.
+        visuals: keep the geoms that never collide, with their meshes and materials.
+    """
+    for name in ("sensors", "actuators", "tendons", "pairs", "flexes", "skins", "sites"):
+        _delete_all(spec, name)
+    for name in ("cameras", "lights"):
+        _delete_all(spec, name)
+    for key in spec.keys:  # sized for the actuators that are gone
+        key.ctrl, key.act = [], []
+    for geom in list(spec.geoms):
+        # a floor or a height field is the world's, and neither can be covered with spheres
+        is_ground = geom.type in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+        if is_ground or (not visuals and not (geom.contype or geom.conaffinity)):
+            spec.delete(geom)
+    if not visuals:
+        for geom in spec.geoms:
+            geom.material = ""
+        for name in ("materials", "textures", "hfields"):
+            _delete_all(spec, name)
+    used = {geom.meshname for geom in spec.geoms}
+    for mesh in list(spec.meshes):
+        if mesh.name not in used and Path(mesh.file).stem not in used:
+            spec.delete(mesh)
+
+
+def _delete_all(spec: mujoco.MjSpec, collection: str) -> None:
+    for element in list(getattr(spec, collection)):
+        spec.delete(element)
+
+
+def check_joints(model: mujoco.MjModel) -> None:
+    """Refuse joints that cannot be planned.
+
+    Raises:
+        ValueError: a joint is free or ball, a slide has no range, or there is no joint at all.
+    """
+    if model.njnt == 0:
+        raise ValueError(
+            "the robot has no joint: nothing to plan; expected at least one hinge or slide joint"
+        )
+    for joint in range(model.njnt):
+        name, kind = model.joint(joint).name, model.jnt_type[joint]
+        if kind in _JOINT_KINDS:
+            body = model.body(model.jnt_bodyid[joint]).name
+            raise ValueError(
+                f"joint '{name}' of body '{body}' is a {_JOINT_KINDS[kind]} joint; expected hinge "
+                "and slide joints on a fixed base: delete it, or replace it by hinges and slides"
+            )
+        if kind == mujoco.mjtJoint.mjJNT_SLIDE and not model.jnt_limited[joint]:
+            raise ValueError(
+                f"slide joint '{name}' has no range; expected range=\"lower upper\" [m]: add it, "
+                f"or fix the joint with freeze={{'{name}': 0.0}}"
+            )
+
+
+def home_positions(model: mujoco.MjModel) -> dict[str, float]:
+    """Joint positions [rad] or [m] of the keyframe 'home', else of the first, else of the zero.
+
+    All are clipped to the limits.
+    """
+    names = [model.key(k).name for k in range(model.nkey)]
+    qpos = model.qpos0
+    if names:
+        qpos = model.key_qpos[names.index("home") if "home" in names else 0]
+    home = {}
+    for j in range(model.njnt):
+        position = qpos[model.jnt_qposadr[j]]
+        if model.jnt_limited[j]:
+            position = np.clip(position, *model.jnt_range[j])
+        home[model.joint(j).name] = float(position)
+    return home
+
+
+def frozen_positions(
+    model: mujoco.MjModel, home: Mapping[str, float], freeze: Mapping[str, float] | None
+) -> dict[str, float]:
+    """Which joints to fix, and where.
+
+    Args:
+        model: with all joints and equalities of the file.
+        home: position of each joint where the caller says nothing.
+        freeze: the caller's choice.
+
+    Returns:
+        Positions [rad] or [m] by joint: those of ``freeze``, and joints that an equality couples.
+
+    Raises:
+        ValueError: a joint of ``freeze`` does not exist or the value is no finite number.
+    """
+    names = [model.joint(j).name for j in range(model.njnt)]
+    frozen = dict(freeze or {})
+    for name, value in frozen.items():
+        if name not in names:
+            raise ValueError(f"freeze: joint '{name}' not in robot; have: {', '.join(names)}")
+        if not np.isfinite(value):
+            raise ValueError(
+                f"freeze: joint '{name}' got {value}; expected a finite position [rad] or [m]"
+            )
+    coupled = {}
+    for k in range(model.neq):
+        if model.eq_type[k] == mujoco.mjtEq.mjEQ_JOINT:
+            for joint in (model.eq_obj1id[k], model.eq_obj2id[k]):
+                if joint >= 0 and names[joint] not in frozen:
+                    coupled[names[joint]] = home[names[joint]]
+    if coupled:
+        warnings.warn(
+            "joints coupled by an equality cannot be planned one by one and are fixed: "
+            + ", ".join(f"{name} = {value:g}" for name, value in coupled.items())
+            + "; pass freeze={joint: position} to choose other positions",
+            stacklevel=3,
+        )
+    return frozen | coupled
+
+
+def freeze_joints(spec: mujoco.MjSpec, positions: Mapping[str, float]) -> None:
+    """Delete equalities, keyframes and the given joints in place; their bodies move accordingly."""
+    for name in ("equalities", "keys"):  # they refer to joints
+        _delete_all(spec, name)
+    for joint in [joint for joint in spec.joints if joint.name in positions]:
+        position, body = positions[joint.name], joint.parent
+        if body.joints[0].name != joint.name:
+            raise ValueError(
+                f"cannot fix joint '{joint.name}': joint '{body.joints[0].name}' of the same body "
+                "comes before it and moves; give each joint a body of its own, or fix both"
+            )
+        if joint.type == mujoco.mjtJoint.mjJNT_SLIDE:
+            offset = (position - joint.ref) * joint.axis / np.linalg.norm(joint.axis)
+            rotation = np.array([1.0, 0.0, 0.0, 0.0])
+        else:
+            degree = np.pi / 180 if spec.compiler.degree else 1.0
+            rotation = np.zeros(4)
+            axis = joint.axis / np.linalg.norm(joint.axis)
+            mujoco.mju_axisAngle2Quat(rotation, axis, position - joint.ref * degree)
+            turned = np.zeros(3)
+            mujoco.mju_rotVecQuat(turned, joint.pos, rotation)
+            offset = joint.pos - turned
+        _move_body(spec, body, offset, rotation)
+        spec.delete(joint)
+
+
+def _move_body(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, offset: np.ndarray, rotation: np.ndarray
+) -> None:
+    """Append a motion, given in the body's own frame, to the body's pose."""
+    quaternion = np.array(body.quat)
+    if body.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT:
+        compiler = spec.compiler
+        quaternion = np.array(
+            spec.resolve_orientation(compiler.degree, compiler.eulerseq, body.alt)
+        )
+        body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    shift, product = np.zeros(3), np.zeros(4)
+    mujoco.mju_rotVecQuat(shift, offset, quaternion)
+    mujoco.mju_mulQuat(product, quaternion, rotation)
+    body.pos = body.pos + shift
+    body.quat = product

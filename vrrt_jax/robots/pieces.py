@@ -1,0 +1,132 @@
+"""The convex pieces that a robot's collision geoms are made of."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+from scipy.spatial import ConvexHull
+
+_ROUND = 48  # sides of the prism around a cylinder; the prism is at most 0.2 % wider
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Piece:
+    """A convex polytope in the frame of its body."""
+
+    vertices: np.ndarray  # (V, 3) [m]
+    triangles: np.ndarray  # (F, 3) int, indices into ``vertices``
+    normals: np.ndarray  # (F, 3) outward unit normals
+    offsets: np.ndarray  # (F,) a point is inside where normals @ x <= offsets
+
+    def depth(self, points: np.ndarray) -> np.ndarray:
+        """Distance (n,) from points (n, 3) inside to the surface [m]; negative outside."""
+        return np.min(self.offsets - points @ self.normals.T, axis=1)
+
+
+def piece_of(points: np.ndarray) -> Piece:
+    """The convex hull of points (n, 3) [m]."""
+    hull = ConvexHull(points)
+    return Piece(
+        vertices=hull.points,
+        triangles=hull.simplices,
+        normals=hull.equations[:, :3],
+        offsets=-hull.equations[:, 3],
+    )
+
+
+def collision_pieces(model: mujoco.MjModel) -> dict[int, list[Piece]]:
+    """Convex pieces of every body with collision geoms.
+
+    Args:
+        model: a compiled robot.
+
+    Returns:
+        Pieces by body index, in the frame of the body.
+
+    Raises:
+        ValueError: a geom has a shape that has no convex hull here.
+    """
+    pieces: dict[int, list[Piece]] = {}
+    for geom in range(model.ngeom):
+        if not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+            continue
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+        points = _geom_points(model, geom) @ rotation.reshape(3, 3).T + model.geom_pos[geom]
+        pieces.setdefault(int(model.geom_bodyid[geom]), []).append(piece_of(points))
+    return pieces
+
+
+def _geom_points(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Points (n, 3) whose convex hull contains the geom, in the geom's frame [m]."""
+    kinds = mujoco.mjtGeom
+    kind, size = model.geom_type[geom], model.geom_size[geom]
+    if kind == kinds.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        start = model.mesh_vertadr[mesh]
+        return np.asarray(model.mesh_vert[start : start + model.mesh_vertnum[mesh]], np.float64)
+    if kind == kinds.mjGEOM_BOX:
+        return _corners() * size
+    if kind == kinds.mjGEOM_CYLINDER:
+        return np.vstack([_circle(size[0], z) for z in (-size[1], size[1])])
+    if kind == kinds.mjGEOM_SPHERE:
+        return _ball() * size[0]
+    if kind == kinds.mjGEOM_ELLIPSOID:
+        return _ball() * size
+    if kind == kinds.mjGEOM_CAPSULE:
+        ball = _ball() * size[0]
+        return np.vstack([ball + [0, 0, z] for z in (-size[1], size[1])])
+    name = model.body(model.geom_bodyid[geom]).name
+    raise ValueError(
+        f"a collision geom of body '{name}' is a {kinds(kind).name[7:].lower()}; expected sphere, "
+        "box, capsule, cylinder, ellipsoid or mesh: replace it"
+    )
+
+
+def _corners() -> np.ndarray:
+    return np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3).astype(float)
+
+
+def _circle(radius: float, z: float) -> np.ndarray:
+    angle = np.arange(_ROUND) * (2 * np.pi / _ROUND)
+    radius = radius / np.cos(np.pi / _ROUND)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(_ROUND, z)], -1)
+
+
+def _ball() -> np.ndarray:
+    """Vertices (n, 3) of a polytope around the unit sphere."""
+    rings = np.linspace(-np.pi / 2, np.pi / 2, _ROUND // 2 + 1)
+    points = np.vstack([_circle(np.cos(a), np.sin(a)) for a in rings])
+    return points / np.cos(np.pi / _ROUND)
+
+
+def surface_samples(pieces: list[Piece], spacing: float, rng: np.random.Generator) -> np.ndarray:
+    """Points on the surface of a union of pieces.
+
+    Args:
+        pieces: of one body.
+        spacing: mean distance between points [m].
+        rng: source of randomness.
+
+    Returns:
+        (n, 3) points [m], the vertices among them.
+    """
+    found = []
+    for index, piece in enumerate(pieces):
+        corners = piece.vertices[piece.triangles]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(cross, axis=1) / 2
+        count = int(np.ceil(area.sum() / spacing**2)) + 50
+        face = rng.choice(len(area), count, p=area / area.sum())
+        u, v = np.sqrt(rng.random(count)), rng.random(count)
+        weight = np.stack([1 - u, u * (1 - v), u * v], -1)
+        points = np.einsum("nk,nkd->nd", weight, corners[face])
+        points = np.vstack([points, piece.vertices[np.unique(piece.triangles)]])
+        others = [other for k, other in enumerate(pieces) if k != index]
+        found.append(points[union_depth(others, points) < 1e-6] if others else points)
+    return np.vstack(found)
+
+
+def union_depth(pieces: list[Piece], points: np.ndarray) -> np.ndarray:
+    """Depth (n,) of points (n, 3) below the surface of the deepest piece [m]; negative outside."""
+    return np.max([piece.depth(points) for piece in pieces], axis=0)

@@ -1,0 +1,133 @@
+"""Spheres that cover convex pieces."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from vrrt_jax.robots import text
+from vrrt_jax.robots.pieces import Piece, collision_pieces, surface_samples, union_depth
+
+_SPACING = 0.004  # [m] between surface samples
+_BULGE = 0.03  # [m] how far spheres fitted on loading stick out
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RobotSpheres:
+    """The spheres of a robot."""
+
+    cover: text.BodySpheres  # cover the moving bodies
+    thin: text.BodySpheres  # follow the surface of all bodies
+    has_kinds: bool  # they were written as two kinds, with the pairs to ignore
+
+
+def spheres_of(model: mujoco.MjModel) -> RobotSpheres:
+    """Spheres of a robot: its own if its collision geoms are all spheres, else fitted ones.
+
+    Args:
+        model: a compiled robot with planned joints only.
+
+    Raises:
+        ValueError: it has no collision geom, or one that spheres cannot be fitted to.
+    """
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    geoms = np.flatnonzero(collides)
+    if len(geoms) == 0:
+        raise ValueError(
+            "the robot has no collision geom: nothing to keep free of obstacles; expected geoms "
+            "with contype or conaffinity: add them, or spheres"
+        )
+    if np.any(model.geom_type[geoms] != mujoco.mjtGeom.mjGEOM_SPHERE):
+        return _fitted(model)
+    is_cover, is_thin = (_is_kind(model, geoms, kind) for kind in (text.COVER, text.THIN))
+    has_kinds = bool(np.all(is_cover | is_thin))
+    if not has_kinds:
+        is_cover = is_thin = np.ones(len(geoms), bool)
+    is_moving = model.body_weldid[model.geom_bodyid[geoms]] != 0
+    return RobotSpheres(
+        cover=_select(model, geoms[is_cover & is_moving]),
+        thin=_select(model, geoms[is_thin]),
+        has_kinds=has_kinds,
+    )
+
+
+def _is_kind(model: mujoco.MjModel, geoms: np.ndarray, kind: dict[str, str]) -> np.ndarray:
+    return (
+        (model.geom_group[geoms] == int(kind["group"]))
+        & (model.geom_contype[geoms] == int(kind["contype"]))
+        & (model.geom_conaffinity[geoms] == int(kind["conaffinity"]))
+    )
+
+
+def _select(model: mujoco.MjModel, geoms: np.ndarray) -> text.BodySpheres:
+    return text.BodySpheres(
+        body=model.geom_bodyid[geoms],
+        centre=model.geom_pos[geoms],
+        radius=model.geom_size[geoms, 0],
+    )
+
+
+def _fitted(model: mujoco.MjModel) -> RobotSpheres:
+    rng = np.random.default_rng(0)
+    body, centre, radius = [], [], []
+    for index, pieces in collision_pieces(model).items():
+        centres, radii = cover_body(pieces, _BULGE, rng)
+        body.append(np.full(len(radii), index))
+        centre.append(centres)
+        radius.append(radii)
+    bodies, centres, radii = np.hstack(body), np.vstack(centre), np.hstack(radius)
+    moves = model.body_weldid[bodies] != 0
+    return RobotSpheres(
+        cover=text.BodySpheres(body=bodies[moves], centre=centres[moves], radius=radii[moves]),
+        # spheres that stick out always touch those of the next link but one
+        thin=text.BodySpheres(body=bodies, centre=centres, radius=radii - _BULGE / 2),
+        has_kinds=False,
+    )
+
+
+def cover_body(
+    pieces: list[Piece], bulge: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Greedy medial spheres that cover the surface of a body.
+
+    Args:
+        pieces: convex pieces of the body.
+        bulge: how far a sphere may stick out of the piece that it lies in [m].
+        rng: source of randomness.
+
+    Returns:
+        Centres (n, 3) and radii (n,) [m].
+    """
+    surface = surface_samples(pieces, _SPACING, rng)
+    centres = _inner_points(pieces, surface, rng)
+    radii = union_depth(pieces, centres) + bulge
+    covers = np.linalg.norm(surface[:, None] - centres, axis=-1) <= radii
+    left = np.ones(len(surface), bool)
+    chosen = []
+    while left.any():
+        gain = covers[left].sum(0)
+        best = int(np.argmax(gain))
+        if gain[best] == 0:
+            break
+        chosen.append(best)
+        left &= ~covers[:, best]
+    return centres[chosen], radii[chosen]
+
+
+def _inner_points(pieces: list[Piece], surface: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Points (n, 3) inside the body where spheres may be centred: random ones, pushed inwards."""
+    found = []
+    for piece in pieces:
+        corners = piece.vertices[np.unique(piece.triangles)]
+        points = rng.dirichlet(np.full(len(corners), 0.3), 600) @ corners
+        points = np.vstack([points, surface[rng.choice(len(surface), 300)]])
+        points = points[piece.depth(points) > -1e-6]
+        step = 0.02
+        for _ in range(40):  # uphill in depth: towards the medial axis
+            moved = points + rng.normal(size=points.shape) * step
+            better = piece.depth(moved) > piece.depth(points)
+            found.append(points[rng.random(len(points)) < 0.05])
+            points = np.where(better[:, None], moved, points)
+            step *= 0.93
+        found.append(points)
+    return np.vstack(found)

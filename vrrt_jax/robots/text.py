@@ -1,0 +1,110 @@
+"""Write the collision model of a robot as MJCF: bodies, joints and spheres, no mesh."""
+
+import dataclasses
+import xml.etree.ElementTree as ET
+
+import mujoco
+import numpy as np
+
+# Robot spheres of two kinds and obstacles (contype=1 conaffinity=0) share a model. MuJoCo checks
+# a pair where one's contype meets the other's conaffinity: cover against obstacle, thin against
+# thin, and nothing else.
+COVER = {"group": "3", "contype": "0", "conaffinity": "1"}
+THIN = {"group": "4", "contype": "2", "conaffinity": "2"}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BodySpheres:
+    """Spheres bound to bodies of a model."""
+
+    body: np.ndarray  # (n,) int
+    centre: np.ndarray  # (n, 3) in the frame of the body [m]
+    radius: np.ndarray  # (n,) [m]
+
+
+def collision_mjcf(
+    model: mujoco.MjModel,
+    *,
+    name: str,
+    cover: BodySpheres,
+    thin: BodySpheres,
+    allowed: list[tuple[str, str]],
+    home: np.ndarray,
+    comment: str = "",
+) -> str:
+    """The text of a model that C MuJoCo compiles by itself.
+
+    Args:
+        model: bodies and joints to write; its geoms are left out.
+        name: of the robot.
+        cover: spheres checked against obstacles.
+        thin: spheres checked against each other.
+        allowed: pairs of bodies that are not checked against each other.
+        home: (D,) joint positions of the keyframe [rad] or [m].
+        comment: written at the top.
+    """
+    root = ET.Element("mujoco", model=name)
+    if comment:
+        root.append(ET.Comment(comment))
+    # masses are of no interest, but bodies without spheres must compile too
+    ET.SubElement(
+        root, "compiler", angle="radian", autolimits="true", boundmass="1", boundinertia="0.01"
+    )
+    default = ET.SubElement(root, "default")
+    for label, bits in (("cover", COVER), ("thin", THIN)):
+        ET.SubElement(ET.SubElement(default, "default", {"class": label}), "geom", bits)
+    elements = {0: ET.SubElement(root, "worldbody")}
+    for body in range(model.nbody):
+        if body:
+            parent = elements[int(model.body_parentid[body])]
+            elements[body] = _add_body(parent, model, body)
+        for label, spheres in (("cover", cover), ("thin", thin)):
+            for k in np.flatnonzero(spheres.body == body):
+                where = {"pos": _numbers(spheres.centre[k]), "size": _numbers(spheres.radius[k])}
+                ET.SubElement(elements[body], "geom", {"class": label} | where)
+    contact = ET.SubElement(root, "contact")
+    for first, second in allowed:
+        ET.SubElement(contact, "exclude", body1=first, body2=second)
+    ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="home", qpos=_numbers(home))
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_body(parent: ET.Element, model: mujoco.MjModel, body: int) -> ET.Element:
+    """A body and its joints; each further joint gets a body of its own inside."""
+    name = model.body(body).name
+    joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
+    element = ET.SubElement(parent, "body", name=name)
+    if np.any(model.body_pos[body]):
+        element.set("pos", _numbers(model.body_pos[body]))
+    if not np.allclose(model.body_quat[body], [1, 0, 0, 0], atol=1e-15):
+        element.set("quat", _numbers(model.body_quat[body]))
+    for count, joint in enumerate(joints):
+        if count:
+            # the first keeps the plain name only if it is the last: that one carries the geoms
+            element.set("name", f"{name}__{model.joint(joint - 1).name}")
+            element = ET.SubElement(element, "body", name=name)
+        _add_joint(element, model, joint)
+    return element
+
+
+def _add_joint(element: ET.Element, model: mujoco.MjModel, joint: int) -> None:
+    kind = mujoco.mjtJoint(model.jnt_type[joint]).name[6:].lower()
+    attributes = {
+        "name": model.joint(joint).name,
+        "type": kind,
+        "axis": _numbers(model.jnt_axis[joint]),
+    }
+    if np.any(model.jnt_pos[joint]):
+        attributes["pos"] = _numbers(model.jnt_pos[joint])
+    if model.jnt_limited[joint]:
+        attributes["range"] = _numbers(model.jnt_range[joint])
+    reference = model.qpos0[model.jnt_qposadr[joint]]
+    if reference:
+        attributes["ref"] = _numbers(reference)
+    ET.SubElement(element, "joint", attributes)
+
+
+def _numbers(values: np.ndarray | float) -> str:
+    # `+ 0.0` turns -0 into 0
+    return " ".join(f"{value + 0.0:.10g}" for value in np.atleast_1d(values))
