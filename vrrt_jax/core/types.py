@@ -92,7 +92,7 @@ class Expansion:
     q: jax.Array  # (B, D) the children
     slot: jax.Array  # (B,) i32 where each went, N (out of range) if rejected
     accepted: jax.Array  # (B,) bool
-    free: jax.Array  # (B,) bool, the edge was free (wholly, or partly where allowed)
+    blocked: jax.Array  # (B,) bool, something lies on the edge
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -132,9 +132,7 @@ class ExpansionPolicy(Protocol[Payload]):
         """Choose a parent and a target for each of the B lanes."""
         ...
 
-    def evaluate(
-        self, world: Any, q: jax.Array, proposals: Proposals
-    ) -> tuple[jax.Array, Payload]:
+    def evaluate(self, world: Any, q: jax.Array, proposals: Proposals) -> tuple[jax.Array, Payload]:
         """Scores (B,) and payloads (B, ...) of the children ``q`` (B, D)."""
         ...
 

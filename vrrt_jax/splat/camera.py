@@ -88,24 +88,14 @@ def orbit(
     return look_at(eye.tolist(), target, fovy_deg=fovy_deg, height=height, width=width)
 
 
-def resized(camera: Camera, height: int, width: int) -> Camera:
-    """The same view with another number of pixels.
-
-    Raises:
-        ValueError: the new size has another aspect ratio.
-    """
-    if height * camera.width != width * camera.height:
-        raise ValueError(
-            f"cannot resize a {camera.width}x{camera.height} camera to {width}x{height}: "
-            "keep the aspect ratio"
-        )
-    scale = height / camera.height
+def shrunk(camera: Camera, factor: int) -> Camera:
+    """The same view with blocks of ``factor`` x ``factor`` pixels made one; rounds the size up."""
     return dataclasses.replace(
         camera,
-        focal=camera.focal * scale,
-        centre=camera.centre * scale,
-        height=height,
-        width=width,
+        focal=camera.focal / factor,
+        centre=camera.centre / factor,
+        height=-(-camera.height // factor),
+        width=-(-camera.width // factor),
     )
 
 

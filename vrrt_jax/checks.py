@@ -1,0 +1,110 @@
+"""Checks at the border: what, got, expected, and what to do next."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax.core.kinematics import link_poses
+from vrrt_jax.core.verify import contacts
+from vrrt_jax.core.world import World, is_free, obstacle_list
+from vrrt_jax.robots.robot import Robot
+from vrrt_jax.splat.camera import project
+from vrrt_jax.splat.model import SelfModel
+from vrrt_jax.splat.types import Camera, SplatModel
+
+# name: (lowest, highest, is the highest allowed)
+RANGES = {
+    "alpha": (0.0, 1.0),
+    "epsilon": (0.0, 1.0),
+    "eta": (0.0, 1.0),
+    "exploration": (0.0, 1.0),
+    "anneal": (0.0, np.inf),
+    "match_scale": (0.0, np.inf),
+    "rewire_radius": (0.0, np.inf),
+    "min_improvement": (0.0, np.inf),
+    "verify_step": (1e-4, 1.0),
+    "time_limit_s": (0.0, np.inf),
+    "max_iterations": (1, np.inf),
+    "patience": (1, np.inf),
+    "shortcut_rounds": (0, np.inf),
+    "lanes": (1, 4096),
+    "image_px": (8, 4096),
+}
+
+
+def check_config(config: Any) -> None:
+    """Raise a ValueError that names the setting out of range."""
+    for name, (low, high) in RANGES.items():
+        value = getattr(config, name)
+        if value is not None and not low <= value <= high:
+            raise ValueError(f"{name}={value} is out of range; expected {low} to {high}")
+    for name in ("kappa", "beta1", "beta2"):
+        if not 0.0 <= getattr(config, name) < 1.0:
+            raise ValueError(f"{name}={getattr(config, name)} is out of range; expected [0, 1)")
+    if config.capacity < config.lanes + 2:
+        raise ValueError(
+            f"capacity={config.capacity} leaves no room for one iteration of {config.lanes} "
+            f"lanes; expected at least {config.lanes + 2}, for example 8192"
+        )
+
+
+def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.ndarray:
+    """Check a configuration against shape, limits and collision; returns it as float32 (D,).
+
+    Raises:
+        ValueError: names the joint, value and bounds, or the bodies that touch.
+    """
+    q = np.asarray(q, np.float32)
+    names = robot.joint_names
+    if q.shape != (len(names),):
+        raise ValueError(
+            f"the {what} has shape {q.shape}; expected ({len(names)},) for the joints "
+            f"{', '.join(names)}"
+        )
+    for name, value, low, high, wraps in zip(
+        names, q, robot.lower, robot.upper, robot.wraps, strict=True
+    ):
+        if not np.isfinite(value) or (not wraps and not low - 1e-5 <= value <= high + 1e-5):
+            raise ValueError(
+                f"the {what} is outside the limits: joint '{name}' is at {value:.4f}, its bounds "
+                f"are [{low:.4f}, {high:.4f}]"
+            )
+    q = np.where(robot.wraps, q, np.clip(q, robot.lower, robot.upper)).astype(np.float32)
+    if not bool(jax.jit(is_free)(world, jnp.asarray(q))):
+        touching = contacts(robot, obstacle_list(world), q)
+        if not touching:
+            touching = contacts(robot, obstacle_list(world), q, geometry="spheres")
+        raise ValueError(
+            f"the {what} is in collision: {'; '.join(touching[:4]) or 'within the margin'}; move "
+            "the robot or the obstacle"
+        )
+    return q
+
+
+def check_self_model(robot: Robot, self_model: SelfModel) -> None:
+    """Raise a ValueError if the self-model was trained for another robot."""
+    if self_model.robot != robot.name or len(self_model.joint_names) != len(robot.joint_names):
+        raise ValueError(
+            f"the self-model is of '{self_model.robot}' with joints "
+            f"{', '.join(self_model.joint_names)}; this robot is '{robot.name}' with joints "
+            f"{', '.join(robot.joint_names)}: give its own self-model, or train one with: vrrt fit"
+        )
+
+
+def check_cameras(robot: Robot, splats: SplatModel, cameras: Camera, q: np.ndarray) -> None:
+    """Raise a ValueError for a camera that has no part of the robot in its picture."""
+    poses = link_poses(robot.chain, jnp.asarray(q))[splats.link]
+    points = jnp.einsum("gij,gj->gi", poses[:, :3, :3], splats.mean) + poses[:, :3, 3]
+    for view in range(len(cameras.focal)):
+        camera = jax.tree.map(lambda leaf: leaf[view], cameras)  # noqa: B023 - used at once
+        pixel, depth = project(camera, points)
+        size = jnp.array([camera.width, camera.height])
+        inside = jnp.all((pixel > 0) & (pixel < size), axis=-1) & (depth > 0.05)
+        if not bool(jnp.any(inside)):
+            eye = -camera.world_to_cam[:3, :3].T @ camera.world_to_cam[:3, 3]
+            raise ValueError(
+                f"camera {view} at {np.round(np.asarray(eye), 2).tolist()} does not see the robot; "
+                "check world_to_cam (x right, y down, z forward) and the focal length"
+            )

@@ -1,0 +1,75 @@
+"""One iteration: B expansions of a tree, for every planner."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from vrrt_jax.core import tree as trees
+from vrrt_jax.core.edges import free_steps, normalise, steer
+from vrrt_jax.core.types import Expansion, ExpansionPolicy, Payload, Rejection, Tree
+from vrrt_jax.core.world import World
+
+SHORTEST_EDGE = 1e-5  # [rad] a shorter step would only duplicate its parent
+
+
+def expand(
+    world: World, policy: ExpansionPolicy[Payload], tree: Tree[Payload], key: jax.Array
+) -> Tree[Payload]:
+    """Propose, steer, check edges, filter, evaluate, insert, and let the policy follow up.
+
+    Args:
+        world: robot and obstacles.
+        policy: the planner.
+        tree: the tree to grow.
+        key: the search's key; the iteration's own is folded in here, so that results do not depend
+            on how iterations are grouped into chunks.
+    """
+    proposals = policy.propose(world, tree, jax.random.fold_in(key, tree.iteration))
+    parent = jnp.where(proposals.ok, proposals.parent, 0)
+    q_from = tree.q[parent]
+    max_length = policy.edge_steps * world.resolution
+    step = steer(world, q_from, proposals.target, max_length)
+
+    passed = free_steps(world, q_from, step, policy.edge_steps)
+    free = (passed == policy.edge_steps) | (proposals.partial & (passed > 0))
+    step = step * (passed / policy.edge_steps)[:, None]
+    length = jnp.sqrt(jnp.sum(step**2, axis=-1))
+    q = normalise(world, q_from + step)
+
+    # A NaN target gives a NaN length: caught as not finite, before it can look like a limit.
+    finite = jnp.isfinite(length)
+    candidate = proposals.ok & finite & free & (length > SHORTEST_EDGE)
+    score, payload = policy.evaluate(world, jnp.where(candidate[:, None], q, q_from), proposals)
+    finite &= jnp.isfinite(score)
+    for leaf in jax.tree.leaves(payload):
+        finite &= jnp.all(jnp.isfinite(leaf.reshape(leaf.shape[0], -1)), axis=1)
+
+    tree_before = tree
+    tree, slot = trees.insert(
+        tree,
+        q=q,
+        parent=parent,
+        cost=tree.cost[parent] + length,
+        score=score,
+        payload=payload,
+        ok=candidate & finite,
+    )
+    accepted = slot < tree.capacity
+    reasons = (  # the first that holds, in the order of Rejection
+        ~proposals.ok,
+        finite & free & (length <= SHORTEST_EDGE),
+        finite & ~free,
+        ~finite,
+        ~accepted,
+    )
+    rejected = jnp.zeros_like(tree.rejected)
+    counted = jnp.zeros_like(accepted)
+    for reason, lanes in zip(Rejection, reasons, strict=True):
+        rejected = rejected.at[reason].set(jnp.sum(lanes & ~counted))
+        counted |= lanes
+    tree = dataclasses.replace(
+        tree, iteration=tree_before.iteration + 1, rejected=tree_before.rejected + rejected
+    )
+    expansion = Expansion(q=q, slot=slot, accepted=accepted, blocked=passed < policy.edge_steps)
+    return policy.after_insert(world, tree, proposals, expansion)

@@ -1,0 +1,184 @@
+"""RRT, RRT* and RRT-Connect to a joint goal, as policies of the kernel."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax.core import tree as trees
+from vrrt_jax.core.edges import distance
+from vrrt_jax.core.rewire import rewire
+from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
+from vrrt_jax.core.world import World
+
+SAME = 1e-4  # [rad] configurations nearer than this are one
+
+
+def sample_configurations(world: World, key: jax.Array, num: int) -> jax.Array:
+    """Uniform configurations (num, D) inside the limits."""
+    return jax.random.uniform(
+        key, (num, world.lower.shape[0]), minval=world.lower, maxval=world.upper
+    )
+
+
+@pytree
+class RRT:
+    """Single-tree RRT (LaValle 1998); RRT* (Karaman and Frazzoli 2011) with a ``rewire_radius``.
+
+    A node's score is its distance to the goal.
+    """
+
+    goal: jax.Array  # (D,)
+    goal_bias: jax.Array  # () share of lanes that aim at the goal
+    rewire_radius: jax.Array  # () [rad], used if ``star``
+    star: bool = static(default=False)
+    lanes: int = static(default=32)
+    edge_steps: int = static(default=32)
+
+    def root(self, world: World, q: jax.Array) -> tuple[jax.Array, None]:
+        """Score of a root; there is no payload."""
+        return distance(world, q, self.goal), None
+
+    def propose(self, world: World, tree: Tree, key: jax.Array) -> Proposals:
+        """Extend the nearest nodes towards random configurations, or the goal."""
+        key_q, key_bias = jax.random.split(key)
+        target = sample_configurations(world, key_q, self.lanes)
+        aims = jax.random.uniform(key_bias, (self.lanes, 1)) < self.goal_bias
+        target = jnp.where(aims.at[0].set(tree.iteration == 0), self.goal, target)
+        parent = jnp.argmin(trees.distances(world, tree, target), axis=1)
+        everywhere = jnp.ones(self.lanes, bool)
+        return Proposals(
+            parent=parent.astype(jnp.int32),
+            target=target,
+            ok=everywhere,
+            partial=~everywhere,
+            carry=None,
+        )
+
+    def evaluate(self, world: World, q: jax.Array, proposals: Proposals):
+        """Distances (B,) to the goal."""
+        return distance(world, q, self.goal), None
+
+    def after_insert(
+        self, world: World, tree: Tree, proposals: Proposals, expansion: Expansion
+    ) -> Tree:
+        """Rewire, if this is RRT*."""
+        if not self.star:
+            return tree
+        return rewire(world, tree, expansion, radius=self.rewire_radius, edge_steps=self.edge_steps)
+
+
+@pytree
+class ConnectNode:
+    """What RRT-Connect keeps for a node."""
+
+    side: jax.Array  # (N,) i32 0 grown from the start, 1 from the goal
+    fresh: jax.Array  # (N,) bool, has yet to be connected to the other tree
+    meets: jax.Array  # (N,) i32 node of the other tree at the same place, -1 if none
+
+
+@pytree
+class RRTConnect:
+    """RRT-Connect (Kuffner and LaValle 2000): two trees in one forest of two roots.
+
+    Half of the lanes extend either tree towards random configurations; the other half drive nodes
+    that have not tried yet towards the nearest node of the other tree, as far as the way is free.
+    A node that arrives scores 0.
+    """
+
+    lanes: int = static(default=32)
+    edge_steps: int = static(default=32)
+
+    def root(self, world: World, q: jax.Array) -> tuple[jax.Array, ConnectNode]:
+        """Score and payload of a single root, the start's."""
+        node = ConnectNode(side=jnp.int32(0), fresh=jnp.bool_(True), meets=jnp.int32(-1))
+        return jnp.float32(jnp.inf), node
+
+    def forest(self, q_start: jax.Array, q_goal: jax.Array, capacity: int) -> Tree[ConnectNode]:
+        """The two trees before the first iteration."""
+        ends = ConnectNode(
+            side=jnp.array([0, 1], jnp.int32),
+            fresh=jnp.array([True, True]),
+            meets=jnp.array([-1, -1], jnp.int32),
+        )
+        far = jnp.full(2, jnp.finfo(jnp.float32).max)
+        return trees.create(jnp.stack([q_start, q_goal]), far, ends, capacity)
+
+    def propose(self, world: World, tree: Tree[ConnectNode], key: jax.Array) -> Proposals:
+        """Connect the newest fresh nodes; extend with all other lanes."""
+        lane = jnp.arange(self.lanes)
+        index = jnp.arange(tree.capacity)
+        node = tree.payload
+        waiting = node.fresh & trees.occupied(tree)
+        newest, chosen = jax.lax.top_k(jnp.where(waiting, index, -1), self.lanes // 2)
+        half = self.lanes - self.lanes // 2
+        connects = jnp.concatenate([jnp.zeros(half, bool), newest >= 0])
+        chosen = jnp.concatenate([jnp.zeros(half, jnp.int32), chosen.astype(jnp.int32)])
+
+        aim = jnp.where(
+            connects[:, None], tree.q[chosen], sample_configurations(world, key, self.lanes)
+        )
+        side = jnp.where(connects, 1 - node.side[chosen], lane % 2)
+        apart = trees.distances(world, tree, aim)
+        nearest = jnp.argmin(jnp.where(node.side == side[:, None], apart, jnp.inf), axis=1)
+        nearest = nearest.astype(jnp.int32)
+        return Proposals(
+            parent=jnp.where(connects, chosen, nearest),
+            target=jnp.where(connects[:, None], tree.q[nearest], aim),
+            ok=jnp.ones(self.lanes, bool),
+            partial=jnp.ones(self.lanes, bool),
+            carry=(
+                connects,
+                nearest,
+                tree.q[nearest],
+                node.side[jnp.where(connects, chosen, nearest)],
+            ),
+        )
+
+    def evaluate(self, world: World, q: jax.Array, proposals: Proposals):
+        """0 for children that arrived; the way left, or a large number, for the others."""
+        connects, nearest, target, side = proposals.carry
+        left = distance(world, q, target)
+        arrived = connects & (left < SAME)
+        score = jnp.where(connects, jnp.where(arrived, 0.0, left), 1e6)
+        node = ConnectNode(
+            side=side.astype(jnp.int32),
+            fresh=~arrived,
+            meets=jnp.where(arrived, nearest, -1).astype(jnp.int32),
+        )
+        return score, node
+
+    def after_insert(
+        self,
+        world: World,
+        tree: Tree[ConnectNode],
+        proposals: Proposals,
+        expansion: Expansion,
+    ) -> Tree[ConnectNode]:
+        """A node has had its try; a child that ran into something while connecting has too."""
+        connects = proposals.carry[0]
+        tried = jnp.where(connects, proposals.parent, tree.capacity)
+        stuck = jnp.where(connects & expansion.blocked, expansion.slot, tree.capacity)
+        fresh = tree.payload.fresh.at[tried].set(False, mode="drop")
+        fresh = fresh.at[stuck].set(False, mode="drop")
+        return dataclasses.replace(tree, payload=dataclasses.replace(tree.payload, fresh=fresh))
+
+
+def connection_path(tree: Tree[ConnectNode]) -> np.ndarray | None:
+    """The path (P, D) from start to goal through the place where the trees met, if they did."""
+    best = int(np.argmin(tree.score))
+    other = int(tree.payload.meets[best])
+    if other < 0:
+        return None
+    halves = [trees.lineage(tree, best), trees.lineage(tree, other)]
+    if int(tree.payload.side[best]) == 1:
+        halves.reverse()
+    q = np.asarray(tree.q)
+    return np.concatenate([q[halves[0]], q[halves[1][::-1]][1:]])
+
+
+def tree_path(tree: Tree, index: int | None = None) -> np.ndarray:
+    """The path (P, D) from the root to a node, the one with the best score by default."""
+    index = int(np.argmin(tree.score)) if index is None else index
+    return np.asarray(tree.q)[trees.lineage(tree, index)]

@@ -1,0 +1,216 @@
+"""The loop around the kernel: jitted chunks on the device; clock, progress, Ctrl-C on the host."""
+
+import contextlib
+import dataclasses
+import enum
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax.core.expand import expand
+from vrrt_jax.core.types import ExpansionPolicy, Tree, pytree
+from vrrt_jax.core.world import World
+
+CHUNK = 8  # iterations between two looks at the clock
+
+
+class Stopped(enum.IntEnum):
+    """Why a search ended."""
+
+    REACHED = 0  # a node's score is at or below the goal score
+    CONVERGED = 1  # the best score no longer improves
+    ITERATIONS = 2
+    TREE_FULL = 3
+    TIME_LIMIT = 4
+    INTERRUPTED = 5
+
+
+@pytree
+class Stop:
+    """When to stop, as traced numbers."""
+
+    score: jax.Array  # () goal score
+    max_iterations: jax.Array  # () i32
+    patience: jax.Array  # () i32 iterations within which the best score must improve ...
+    min_improvement: jax.Array  # () ... by this much
+
+
+@pytree
+class SearchState:
+    """A tree on its way, with what the patience rule remembers."""
+
+    tree: Tree
+    reference_score: jax.Array  # ()
+    reference_iteration: jax.Array  # () i32
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SearchResult:
+    """A finished search."""
+
+    tree: Tree
+    stopped: Stopped
+    history: np.ndarray  # (chunks, 4): iteration, seconds, best score, nodes
+    compile_s: float
+    search_s: float
+
+
+def make_stop(
+    score: float,
+    *,
+    max_iterations: int,
+    patience: int | None = None,
+    min_improvement: float = 0.0,
+) -> Stop:
+    """A stopping rule; without ``patience`` the search never counts as converged."""
+    return Stop(
+        score=jnp.float32(score),
+        max_iterations=jnp.int32(max_iterations),
+        patience=jnp.int32(patience if patience is not None else np.iinfo(np.int32).max),
+        min_improvement=jnp.float32(min_improvement),
+    )
+
+
+def initial_state(tree: Tree) -> SearchState:
+    """The state of a search that has not begun."""
+    return SearchState(
+        tree=tree, reference_score=jnp.min(tree.score), reference_iteration=tree.iteration
+    )
+
+
+def why_stopped(state: SearchState, stop: Stop) -> jax.Array:
+    """The :class:`Stopped` code () that holds, -1 while the search should go on."""
+    tree = state.tree
+    reasons = (
+        (Stopped.REACHED, jnp.min(tree.score) <= stop.score),
+        (Stopped.CONVERGED, tree.iteration - state.reference_iteration >= stop.patience),
+        (Stopped.ITERATIONS, tree.iteration >= stop.max_iterations),
+        (Stopped.TREE_FULL, tree.size >= tree.capacity),
+    )
+    code = jnp.int32(-1)
+    for reason, holds in reversed(reasons):
+        code = jnp.where(holds, jnp.int32(reason), code)
+    return code
+
+
+def run_chunk(
+    world: World,
+    policy: ExpansionPolicy,
+    state: SearchState,
+    stop: Stop,
+    key: jax.Array,
+    num_iterations: jax.Array,
+) -> SearchState:
+    """Up to ``num_iterations`` iterations, fewer when a stopping rule holds."""
+    last = state.tree.iteration + num_iterations
+
+    def goes_on(state: SearchState) -> jax.Array:
+        return (state.tree.iteration < last) & (why_stopped(state, stop) < 0)
+
+    def iterate(state: SearchState) -> SearchState:
+        tree = expand(world, policy, state.tree, key)
+        best = jnp.min(tree.score)
+        improved = best < state.reference_score - stop.min_improvement
+        return SearchState(
+            tree=tree,
+            reference_score=jnp.where(improved, best, state.reference_score),
+            reference_iteration=jnp.where(improved, tree.iteration, state.reference_iteration),
+        )
+
+    return jax.lax.while_loop(goes_on, iterate, state)
+
+
+_chunk = jax.jit(run_chunk)
+_chunks = jax.jit(jax.vmap(run_chunk, in_axes=(None, 0, 0, 0, 0, None)))
+
+
+def search(
+    world: World,
+    policy: ExpansionPolicy,
+    tree: Tree,
+    *,
+    key: jax.Array,
+    stop: Stop,
+    time_limit_s: float = float("inf"),
+    batched: bool = False,
+    on_progress: Callable[[SearchState, float], Any] | None = None,
+) -> SearchResult:
+    """Grow a tree until a stopping rule holds, the time is up or the user interrupts.
+
+    Args:
+        world: robot and obstacles.
+        policy: the planner.
+        tree: the tree to start from.
+        key: random key; the same key gives the same tree on the same machine, unless time stops it.
+        stop: stopping rules.
+        time_limit_s: wall time without compilation [s], looked at every few iterations.
+        batched: policy, tree, key and stop lead with an axis of Q problems; ends when all have.
+        on_progress: called with the state and the seconds so far after every chunk.
+    """
+    state = (jax.vmap(initial_state) if batched else initial_state)(tree)
+    advance = partial(_chunks if batched else _chunk, world, policy)
+    codes = jax.vmap(why_stopped) if batched else why_stopped
+    started = time.perf_counter()
+    jax.block_until_ready(advance(state, stop, key, jnp.int32(0)))
+    compile_s = time.perf_counter() - started
+
+    history: list[tuple[float, float, float, float]] = []
+    started = time.perf_counter()
+    with _interruptible() as interrupted:
+        while True:
+            state = jax.block_until_ready(advance(state, stop, key, jnp.int32(CHUNK)))
+            seconds = time.perf_counter() - started
+            grown = state.tree
+            history.append(
+                (
+                    float(jnp.max(grown.iteration)),
+                    seconds,
+                    float(jnp.max(jnp.min(grown.score, axis=-1))),
+                    float(jnp.max(grown.size)),
+                )
+            )
+            if on_progress is not None:
+                on_progress(state, seconds)
+            code = int(jnp.min(codes(state, stop)))
+            if code >= 0:
+                break
+            if interrupted.is_set():
+                code = Stopped.INTERRUPTED
+                break
+            if seconds >= time_limit_s:
+                code = Stopped.TIME_LIMIT
+                break
+    return SearchResult(
+        tree=state.tree,
+        stopped=Stopped(code),
+        history=np.array(history),
+        compile_s=compile_s,
+        search_s=time.perf_counter() - started,
+    )
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[threading.Event]:
+    """Turn Ctrl-C into a flag, so that the best path so far survives it; a second one is fatal."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+
+    def on_interrupt(signum, frame):
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+
+    previous = signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, previous)

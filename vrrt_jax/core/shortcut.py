@@ -1,0 +1,101 @@
+"""Shortcutting: replace detours by straight edges, a batch of candidates at a time."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax.core.edges import difference, distance, free_steps, normalise
+from vrrt_jax.core.types import pytree
+from vrrt_jax.core.world import World
+
+LANES = 32
+EDGE_STEPS = 128  # sub-steps of a candidate, so the longest is 128 times the resolution
+GAIN = 1e-3  # [rad] smallest saving worth a new corner
+
+
+@pytree
+class _Path:
+    q: jax.Array  # (P, D), the last waypoint repeated beyond ``size``
+    size: jax.Array  # () i32
+    idle: jax.Array  # () i32 rounds since the last success
+    round: jax.Array  # () i32
+
+
+def shortcut(
+    world: World, path: np.ndarray, *, key: jax.Array, rounds: int = 60, patience: int = 12
+) -> np.ndarray:
+    """Shorten a collision-free path; the ends stay.
+
+    In every round 32 pairs of places on the path are drawn, the straight edges between them are
+    checked, and the one that saves most is taken.
+
+    Args:
+        world: robot and obstacles.
+        path: (P, D) waypoints.
+        key: random key.
+        rounds: at most so many.
+        patience: stop after so many rounds without a saving.
+
+    Returns:
+        (P', D) waypoints.
+    """
+    path = np.asarray(path, np.float32)
+    if len(path) < 3:
+        return path
+    room = max(64, 1 << (len(path) + 2).bit_length())  # few sizes, so few compilations
+    padded = np.concatenate([path, np.repeat(path[-1:], room - len(path), axis=0)])
+    done = _shortcut(world, jnp.asarray(padded), jnp.int32(len(path)), key, rounds, patience)
+    return np.asarray(done.q)[: int(done.size)]
+
+
+@jax.jit
+def _shortcut(world: World, q, size, key, rounds, patience) -> _Path:
+    state = _Path(q=q, size=size, idle=jnp.int32(0), round=jnp.int32(0))
+    return jax.lax.while_loop(
+        lambda s: (s.round < rounds) & (s.idle < patience) & (s.size > 2),
+        lambda s: _round(world, s, jax.random.fold_in(key, s.round)),
+        state,
+    )
+
+
+def _round(world: World, path: _Path, key: jax.Array) -> _Path:
+    """Try 32 candidates, splice in the best free one."""
+    step = difference(world, path.q[:-1], path.q[1:])
+    length = jnp.sqrt(jnp.sum(step**2, axis=-1))  # zero beyond the end
+    along = jnp.concatenate([jnp.zeros(1), jnp.cumsum(length)])
+
+    ends = along[-1] * jax.random.uniform(key, (LANES, 2))
+    ends = jnp.sort(ends.at[0].set(jnp.stack([0.0 * along[-1], along[-1]])), axis=1)
+    index = jnp.clip(jnp.searchsorted(along, ends, side="right") - 1, 0, path.size - 2)
+    share = jnp.clip((ends - along[index]) / jnp.maximum(length[index], 1e-9), 0.0, 1.0)
+    q_ends = path.q[index] + share[..., None] * step[index]
+    q_a, q_b = q_ends[:, 0], q_ends[:, 1]
+
+    straight = distance(world, q_a, q_b)
+    saving = ends[:, 1] - ends[:, 0] - straight
+    tried = (saving > GAIN) & (straight <= EDGE_STEPS * world.resolution)
+    edge = jnp.where(tried[:, None], difference(world, q_a, q_b), 0.0)
+    free = free_steps(world, q_a, edge, EDGE_STEPS) == EDGE_STEPS
+    saving = jnp.where(tried & free, saving, 0.0)
+
+    best = jnp.argmax(saving)
+    first, last = index[best, 0], index[best, 1]
+    size = first + 3 + path.size - (last + 1)
+    found = (saving[best] > 0) & (size <= path.q.shape[0])
+    place = jnp.arange(path.q.shape[0])
+    source = jnp.where(place <= first, place, place - (first + 3) + last + 1)
+    spliced = path.q[jnp.clip(source, 0, path.q.shape[0] - 1)]
+    spliced = jnp.where((place == first + 1)[:, None], normalise(world, q_a[best]), spliced)
+    spliced = jnp.where((place == first + 2)[:, None], normalise(world, q_b[best]), spliced)
+    return _Path(
+        q=jnp.where(found, spliced, path.q),
+        size=jnp.where(found, size, path.size),
+        idle=jnp.where(found, 0, path.idle + 1),
+        round=path.round + 1,
+    )
+
+
+def path_length(world: World, path: np.ndarray) -> float:
+    """Length of a path (P, D) [rad]."""
+    path = jnp.asarray(path)
+    return float(jnp.sum(distance(world, path[:-1], path[1:])))

@@ -1,0 +1,109 @@
+"""The tree: allocation, insertion, nearest neighbours and the way back to the root."""
+
+import dataclasses
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax.core.edges import distance
+from vrrt_jax.core.types import Rejection, Tree
+from vrrt_jax.core.world import World
+
+Payload = TypeVar("Payload")
+
+
+def create(q: jax.Array, score: jax.Array, payload: Payload, capacity: int) -> Tree[Payload]:
+    """A tree (or a forest) of R roots.
+
+    Args:
+        q: (R, D) root configurations.
+        score: (R,) their scores.
+        payload: their payloads, leaves (R, ...).
+        capacity: number of slots N, at least R.
+    """
+    roots = q.shape[0]
+
+    def padded(leaf: jax.Array, fill) -> jax.Array:
+        leaf = jnp.asarray(leaf)
+        return jnp.full((capacity, *leaf.shape[1:]), fill, leaf.dtype).at[:roots].set(leaf)
+
+    return Tree(
+        q=padded(q, 0),
+        parent=jnp.full(capacity, -1, jnp.int32),
+        cost=jnp.zeros(capacity, q.dtype),
+        score=padded(score, jnp.inf),
+        size=jnp.int32(roots),
+        iteration=jnp.int32(0),
+        rejected=jnp.zeros(len(Rejection), jnp.int32),
+        payload=jax.tree.map(lambda leaf: padded(leaf, 0), payload),
+    )
+
+
+def insert(
+    tree: Tree[Payload],
+    *,
+    q: jax.Array,
+    parent: jax.Array,
+    cost: jax.Array,
+    score: jax.Array,
+    payload: Payload,
+    ok: jax.Array,
+) -> tuple[Tree[Payload], jax.Array]:
+    """Append the children that are ok, in lane order, as far as there is room.
+
+    Args:
+        tree: the tree.
+        q: (B, D) children.
+        parent: (B,) their parents.
+        cost: (B,) their path lengths from the root.
+        score: (B,) their scores.
+        payload: leaves (B, ...).
+        ok: (B,) which to insert.
+
+    Returns:
+        The new tree, and the slot (B,) of each child; N where it was not inserted.
+    """
+    wanted = tree.size + jnp.cumsum(ok) - 1
+    slot = jnp.where(ok & (wanted < tree.capacity), wanted, tree.capacity).astype(jnp.int32)
+
+    def put(column: jax.Array, rows: jax.Array) -> jax.Array:
+        return column.at[slot].set(rows.astype(column.dtype), mode="drop")
+
+    grown = dataclasses.replace(
+        tree,
+        q=put(tree.q, q),
+        parent=put(tree.parent, parent),
+        cost=put(tree.cost, cost),
+        score=put(tree.score, score),
+        size=jnp.minimum(tree.size + jnp.sum(ok), tree.capacity).astype(jnp.int32),
+        payload=jax.tree.map(put, tree.payload, payload),
+    )
+    return grown, slot
+
+
+def occupied(tree: Tree) -> jax.Array:
+    """(N,) bool, the slots that hold a node."""
+    return jnp.arange(tree.capacity) < tree.size
+
+
+def distances(world: World, tree: Tree, q: jax.Array) -> jax.Array:
+    """Distances (B, N) from configurations (B, D) to every node, +inf to empty slots [rad]."""
+    apart = distance(world, tree.q[None], q[:, None])
+    return jnp.where(occupied(tree), apart, jnp.inf)
+
+
+def lineage(tree: Tree, index: int) -> np.ndarray:
+    """Indices from the root down to a node, on the host.
+
+    Raises:
+        ValueError: the index is not a node.
+    """
+    parent, size = np.asarray(tree.parent), int(tree.size)
+    if not 0 <= index < size:
+        raise ValueError(f"node {index} is not in the tree; it has nodes 0 to {size - 1}")
+    chain = [index]
+    while parent[chain[-1]] >= 0:
+        chain.append(int(parent[chain[-1]]))
+    return np.array(chain[::-1])

@@ -1,0 +1,432 @@
+"""Planning, from the outside: what users call, with every input checked on the host."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax import checks
+from vrrt_jax.core import tree as trees
+from vrrt_jax.core.rrt import RRT, RRTConnect, connection_path, tree_path
+from vrrt_jax.core.search import SearchResult, Stopped, make_stop, search
+from vrrt_jax.core.shortcut import path_length, shortcut
+from vrrt_jax.core.types import Rejection, Status, Tree
+from vrrt_jax.core.verify import Verification, verify_path
+from vrrt_jax.core.world import World, obstacle_list
+from vrrt_jax.robots.robot import Robot
+from vrrt_jax.splat.goal import prepare_goal
+from vrrt_jax.splat.model import SelfModel
+from vrrt_jax.splat.types import Camera
+from vrrt_jax.visual import VisualPolicy
+
+STATUS_OF = {
+    Stopped.CONVERGED: Status.NO_MATCH,
+    Stopped.ITERATIONS: Status.BUDGET,
+    Stopped.TREE_FULL: Status.TREE_FULL,
+    Stopped.TIME_LIMIT: Status.TIME_LIMIT,
+    Stopped.INTERRUPTED: Status.INTERRUPTED,
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlannerConfig:
+    """Settings of Visual-RRT; all but the sizes are traced, so changing them never re-compiles.
+
+    The defaults are what measures best; :meth:`paper` has the published values.
+    """
+
+    alpha: float = 0.04  # Adam step [rad]
+    epsilon: float = 0.04  # exploration step [rad]
+    kappa: float = 0.9  # decay of the frontier's geometric law, in [0, 1)
+    eta: float = 0.7  # share of parents drawn by that law rather than uniformly, in [0, 1]
+    exploration: float = 0.3  # share r of lanes that explore, in [0, 1]
+    beta1: float = 0.9
+    beta2: float = 0.9
+    anneal: float = 10.0  # Adam steps shrink below this many times the match bar; 0 = never
+    match_scale: float = 1.0  # the goal loss, in units of the self-model's calibrated bar
+    rewiring: bool = True  # RRT*
+    rewire_radius: float = 0.3  # [rad]
+    max_iterations: int = 400
+    patience: int | None = 100  # iterations without ``min_improvement`` that end the search
+    min_improvement: float = 1e-4
+    time_limit_s: float = float("inf")  # of the search, compilation excluded [s]
+    shortcut_rounds: int = 60
+    verify_step: float = 0.005  # [rad]
+    lanes: int = 32  # expansions an iteration (re-compiles)
+    capacity: int = 8192  # nodes (re-compiles)
+    image_px: int = 64  # image height that is searched at (re-compiles)
+
+    @classmethod
+    def paper(cls, **changes: Any) -> "PlannerConfig":
+        """The published method (Visual-RRT, CVPR 2026): constant Adam steps, patience rule."""
+        return cls(**{"anneal": 0.0, **changes})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanResult:
+    """What became of a problem."""
+
+    status: Status
+    path: np.ndarray  # (P, D) the shortened, verified path; of a failure, the best attempt
+    raw_path: np.ndarray  # (P', D) as the tree has it
+    loss: float  # of the path's end: image loss, or distance to a joint goal [rad]
+    goal_loss: float  # at or below which it counts as matched
+    cost: float  # length of ``path`` [rad]
+    verification: Verification | None  # None if there was nothing to verify
+    rejected: Mapping[str, int]  # lanes lost, by reason
+    iterations: int
+    timing: Mapping[str, float]  # compile_s, search_s, shortcut_s, verify_s
+    history: np.ndarray  # (chunks, 4): iteration, seconds, best loss, nodes
+    tree: Tree
+
+    @property
+    def ok(self) -> bool:
+        """Solved: matched, collision-free and verified."""
+        return self.status is Status.SOLVED
+
+    @property
+    def q_goal(self) -> np.ndarray:
+        """(D,) the end of the path."""
+        return self.path[-1]
+
+    def __str__(self) -> str:
+        """One line for people."""
+        times = ", ".join(f"{k.removesuffix('_s')} {v:.1f} s" for k, v in self.timing.items())
+        return (
+            f"{self.status.name}: loss {self.loss:.2e} (goal {self.goal_loss:.2e}), "
+            f"{len(self.path)} waypoints, {self.cost:.2f} rad, {self.iterations} iterations; {times}"
+        )
+
+
+def plan(
+    robot: Robot,
+    world: World,
+    self_model: SelfModel,
+    camera: Camera | Sequence[Camera],
+    goal_image: np.ndarray | Sequence[np.ndarray],
+    q_start: np.ndarray,
+    *,
+    key: jax.Array,
+    config: PlannerConfig | None = None,
+    on_progress: Callable[..., Any] | None = None,
+) -> PlanResult:
+    """Find a collision-free path whose end looks like the goal image.
+
+    Args:
+        robot: from :func:`load_robot`.
+        world: from :func:`load_world` or :func:`build_world`, for this robot.
+        self_model: from :func:`load_self_model`, for this robot.
+        camera: the view of the goal image; or V of them.
+        goal_image: (H, W, 4) RGB and mask, or (H, W, 3) on a plain background; uint8, or float in
+            [0, 1]; or V of them.
+        q_start: (D,) start configuration [rad] or [m].
+        key: random key; the same key gives the same plan on the same machine, unless time ends it.
+        config: settings, the default ones if None.
+        on_progress: called with the search state and the seconds so far.
+
+    Raises:
+        ValueError: an input makes no sense; the message says what to do.
+    """
+    config = config or PlannerConfig()
+    checks.check_config(config)
+    q_start = checks.check_start(robot, world, q_start)
+    policy, goal_loss = _visual_policy(robot, self_model, camera, goal_image, q_start, config)
+    tree, compile_s = _timed(_plant, world, policy, jnp.asarray(q_start), config.capacity)
+    found = search(
+        world,
+        policy,
+        tree,
+        key=key,
+        stop=_visual_stop(config, goal_loss),
+        time_limit_s=config.time_limit_s,
+        on_progress=on_progress,
+    )
+    found = dataclasses.replace(found, compile_s=found.compile_s + compile_s)
+    return _finish_visual(robot, world, found, goal_loss, q_start, key, config)
+
+
+def plan_batch(
+    robot: Robot,
+    world: World,
+    self_model: SelfModel,
+    camera: Camera | Sequence[Camera],
+    goal_images: Sequence[np.ndarray | Sequence[np.ndarray]],
+    q_starts: np.ndarray,
+    *,
+    key: jax.Array,
+    config: PlannerConfig | None = None,
+    on_progress: Callable[..., Any] | None = None,
+) -> list[PlanResult]:
+    """Solve Q problems of one robot, world and camera at once, by an outer ``vmap``.
+
+    Problem ``i`` uses the key ``fold_in(key, i)``. The search times reported are those of the whole
+    batch. On a CPU a loop over :func:`plan` is as fast; on other devices the batch pays.
+
+    Args:
+        robot: from :func:`load_robot`.
+        world: for this robot.
+        self_model: for this robot.
+        camera: the view of all goal images; or V of them.
+        goal_images: Q goal images, or Q lists of V; see :func:`plan`.
+        q_starts: (Q, D) start configurations.
+        key: random key.
+        config: settings, the default ones if None.
+        on_progress: called with the batched search state and the seconds so far.
+
+    Raises:
+        ValueError: an input makes no sense; the message names the problem.
+    """
+    config = config or PlannerConfig()
+    checks.check_config(config)
+    if len(goal_images) != len(q_starts) or len(goal_images) == 0:
+        raise ValueError(
+            f"got {len(goal_images)} goal images and {len(q_starts)} starts; expected as many, "
+            "and at least one"
+        )
+    starts, policies, goal_losses = [], [], []
+    for i, (image, q_start) in enumerate(zip(goal_images, q_starts, strict=True)):
+        try:
+            starts.append(checks.check_start(robot, world, q_start))
+            policy, loss = _visual_policy(robot, self_model, camera, image, starts[-1], config)
+        except ValueError as error:
+            raise ValueError(f"problem {i}: {error}") from None
+        policies.append(policy)
+        goal_losses.append(loss)
+    policies = _stack(policies)
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(starts)))
+    started = time.perf_counter()
+    plants = jax.vmap(_plant, (None, 0, 0, None))
+    tree = jax.block_until_ready(
+        plants(world, policies, jnp.asarray(np.stack(starts)), config.capacity)
+    )
+    compile_s = time.perf_counter() - started
+    found = search(
+        world,
+        policies,
+        tree,
+        key=keys,
+        stop=_stack([_visual_stop(config, loss) for loss in goal_losses]),
+        time_limit_s=config.time_limit_s,
+        batched=True,
+        on_progress=on_progress,
+    )
+    results = []
+    for i, (q_start, loss) in enumerate(zip(starts, goal_losses, strict=True)):
+        own_tree = jax.tree.map(lambda leaf: leaf[i], found.tree)  # noqa: B023 - used at once
+        own = dataclasses.replace(found, tree=own_tree, compile_s=found.compile_s + compile_s)
+        results.append(_finish_visual(robot, world, own, loss, q_start, keys[i], config))
+    return results
+
+
+def plan_to_configuration(
+    robot: Robot,
+    world: World,
+    q_start: np.ndarray,
+    q_goal: np.ndarray,
+    *,
+    key: jax.Array,
+    planner: str = "rrt-connect",
+    config: PlannerConfig | None = None,
+    goal_bias: float = 0.1,
+    on_progress: Callable[..., Any] | None = None,
+) -> PlanResult:
+    """Find a collision-free path to a joint goal, on the kernel that Visual-RRT runs on.
+
+    Args:
+        robot: from :func:`load_robot`.
+        world: for this robot.
+        q_start: (D,) [rad] or [m].
+        q_goal: (D,) [rad] or [m].
+        key: random key.
+        planner: "rrt", "rrt-star" (goes on to improve until its iterations are used up) or
+            "rrt-connect".
+        config: budget, capacity, lanes and rewiring radius are used.
+        goal_bias: share of lanes that aim at the goal, for "rrt" and "rrt-star".
+        on_progress: called with the search state and the seconds so far.
+
+    Raises:
+        ValueError: an input makes no sense; the message says what to do.
+    """
+    config = config or PlannerConfig()
+    checks.check_config(config)
+    q_start = checks.check_start(robot, world, q_start)
+    q_goal = checks.check_start(robot, world, q_goal, what="goal")
+    start, goal = jnp.asarray(q_start), jnp.asarray(q_goal)
+    if planner == "rrt-connect":
+        policy: Any = RRTConnect(lanes=config.lanes)
+        tree, stop_score = policy.forest(start, goal, config.capacity), 0.0
+    elif planner in ("rrt", "rrt-star"):
+        policy = RRT(
+            goal=goal,
+            goal_bias=jnp.float32(goal_bias),
+            rewire_radius=jnp.float32(2 * config.rewire_radius),
+            star=planner == "rrt-star",
+            lanes=config.lanes,
+        )
+        score, payload = policy.root(world, start)
+        tree = trees.create(start[None], score[None], payload, config.capacity)
+        stop_score = -1.0 if policy.star else 1e-4
+    else:
+        raise ValueError(f"unknown planner '{planner}'; have: rrt, rrt-star, rrt-connect")
+    stop = make_stop(stop_score, max_iterations=config.max_iterations)
+    found = search(
+        world,
+        policy,
+        tree,
+        key=key,
+        stop=stop,
+        time_limit_s=config.time_limit_s,
+        on_progress=on_progress,
+    )
+    if planner == "rrt-connect":
+        path = connection_path(found.tree)
+    else:
+        path = tree_path(found.tree)
+    loss = float(jnp.min(found.tree.score))
+    if path is None:
+        path = q_start[None]
+    return _finish(robot, world, found, path, loss, max(stop_score, 1e-4), key, config)
+
+
+def _visual_policy(
+    robot: Robot,
+    self_model: SelfModel,
+    camera: Camera | Sequence[Camera],
+    goal_image: Any,
+    q_start: np.ndarray,
+    config: PlannerConfig,
+) -> tuple[VisualPolicy, float]:
+    """The policy, and the loss at which the goal counts as matched."""
+    checks.check_self_model(robot, self_model)
+    if isinstance(camera, Camera):
+        camera, goal_image = [camera], [goal_image]
+    goal, cameras = prepare_goal(goal_image, camera, config.image_px)
+    level = self_model.level_for(goal.coverage.shape[1])
+    checks.check_cameras(robot, level.splats, cameras, q_start)
+    covered = float(jnp.sum(goal.valid * goal.coverage) / jnp.sum(goal.valid))
+    goal_loss = config.match_scale * level.match_bar * covered
+    numbers = {
+        "alpha": config.alpha,
+        "epsilon": config.epsilon,
+        "kappa": config.kappa,
+        "eta": config.eta,
+        "exploration": config.exploration,
+        "beta1": config.beta1,
+        "beta2": config.beta2,
+        "anneal_loss": config.anneal * goal_loss,
+        "rewire_radius": config.rewire_radius,
+    }
+    policy = VisualPolicy(
+        splats=level.splats,
+        cameras=cameras,
+        goal=goal,
+        **{name: jnp.float32(value) for name, value in numbers.items()},
+        rewiring=config.rewiring,
+        lanes=config.lanes,
+    )
+    return policy, goal_loss
+
+
+def _plant(world: World, policy: VisualPolicy, q_start: jax.Array, capacity: int) -> Tree:
+    score, payload = _root(world, policy, q_start)
+    roots = jax.tree.map(lambda leaf: leaf[None], (q_start, score, payload))
+    return trees.create(*roots, capacity)
+
+
+@jax.jit
+def _root(world: World, policy: VisualPolicy, q_start: jax.Array):
+    return policy.root(world, q_start)
+
+
+def _visual_stop(config: PlannerConfig, goal_loss: float):
+    return make_stop(
+        goal_loss,
+        max_iterations=config.max_iterations,
+        patience=config.patience,
+        min_improvement=config.min_improvement,
+    )
+
+
+def _finish_visual(
+    robot: Robot,
+    world: World,
+    found: SearchResult,
+    goal_loss: float,
+    q_start: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+) -> PlanResult:
+    """Of the nodes that match, take the nearest to the start; if none does, the best."""
+    score, q = np.asarray(found.tree.score), np.asarray(found.tree.q)
+    matched = np.flatnonzero(score <= goal_loss)
+    best = int(np.argmin(score))
+    if len(matched):
+        best = int(matched[np.argmin(np.linalg.norm(q[matched] - q_start, axis=1))])
+    path = tree_path(found.tree, best)
+    return _finish(robot, world, found, path, float(score[best]), goal_loss, key, config)
+
+
+def _finish(
+    robot: Robot,
+    world: World,
+    found: SearchResult,
+    raw_path: np.ndarray,
+    loss: float,
+    goal_loss: float,
+    key: jax.Array,
+    config: PlannerConfig,
+) -> PlanResult:
+    """Shorten and verify; if the shortened path fails the exact check, fall back on the raw one."""
+    _, shortcut_compile_s = _timed(shortcut, world, raw_path, key=key, rounds=0)
+    started = time.perf_counter()
+    path = shortcut(world, raw_path, key=key, rounds=config.shortcut_rounds)
+    shortcut_s = time.perf_counter() - started
+
+    started = time.perf_counter()
+    obstacles = obstacle_list(world)
+    verification = verify_path(robot, obstacles, path, step=config.verify_step)
+    if not verification.ok:
+        raw = verify_path(robot, obstacles, raw_path, step=config.verify_step)
+        if raw.ok:
+            path, verification = raw_path, raw
+    verify_s = time.perf_counter() - started
+
+    if loss > goal_loss:
+        status = STATUS_OF.get(found.stopped, Status.NO_MATCH)
+    else:
+        status = Status.SOLVED if verification.ok else Status.NOT_VERIFIED
+    rejected = np.asarray(found.tree.rejected)
+    return PlanResult(
+        status=status,
+        path=path,
+        raw_path=raw_path,
+        loss=loss,
+        goal_loss=goal_loss,
+        cost=path_length(world, path),
+        verification=verification,
+        rejected={reason.name.lower(): int(rejected[reason]) for reason in Rejection},
+        iterations=int(found.tree.iteration),
+        timing={
+            "compile_s": found.compile_s + shortcut_compile_s,
+            "search_s": found.search_s,
+            "shortcut_s": shortcut_s,
+            "verify_s": verify_s,
+        },
+        history=found.history,
+        tree=found.tree,
+    )
+
+
+def _timed(function: Callable, *args: Any, **kwargs: Any) -> tuple[Any, float]:
+    """The result, and the seconds it took; of a first call, most of them are compilation."""
+    started = time.perf_counter()
+    result = jax.block_until_ready(function(*args, **kwargs))
+    return result, time.perf_counter() - started
+
+
+def _stack(items: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)

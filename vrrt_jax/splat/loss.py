@@ -1,0 +1,40 @@
+"""How far a rendered robot is from a goal image."""
+
+import jax
+import jax.numpy as jnp
+
+from vrrt_jax.core.kinematics import Chain, link_poses
+from vrrt_jax.splat.raster import render
+from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
+
+
+def image_loss(
+    rgb: jax.Array,
+    coverage: jax.Array,
+    goal_rgb: jax.Array,
+    goal_coverage: jax.Array,
+    valid: jax.Array,
+) -> jax.Array:
+    """Mean squared error () over the valid pixels and the four channels of one view."""
+    error = jnp.sum((rgb - goal_rgb) ** 2, axis=-1) + (coverage - goal_coverage) ** 2
+    return jnp.sum(valid * error) / (4.0 * jnp.maximum(jnp.sum(valid), 1.0))
+
+
+def goal_loss(
+    chain: Chain, splats: SplatModel, cameras: Camera, goal: GoalImage, q: jax.Array
+) -> jax.Array:
+    """Loss () of a configuration (D,): the mean over the V views."""
+    poses = link_poses(chain, q)
+    losses = []
+    for view in range(goal.rgb.shape[0]):
+        camera = jax.tree.map(lambda leaf: leaf[view], cameras)  # noqa: B023 - used at once
+        rgb, coverage = render(splats, poses, camera)
+        losses.append(
+            image_loss(rgb, coverage, goal.rgb[view], goal.coverage[view], goal.valid[view])
+        )
+    return sum(losses) / len(losses)
+
+
+def psnr_db(mean_squared_error: float) -> float:
+    """Peak signal-to-noise ratio of images in [0, 1] [dB]."""
+    return float(-10.0 * jnp.log10(mean_squared_error))

@@ -1,0 +1,113 @@
+"""Self-models: a robot's trained splats in several levels of detail, in one small file."""
+
+import dataclasses
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax.splat.types import SplatModel
+
+FORMAT = 1
+ARRAYS = ("mean", "radius", "density", "rgb", "shade", "link", "tau")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Level:
+    """One level of detail, trained for images of one height."""
+
+    splats: SplatModel
+    size_px: int  # image height that it was trained at [px]
+    psnr_db: float  # on unseen poses and cameras, over RGB and coverage
+    match_bar: float  # loss over covered share, under which 95 % of true poses lie
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SelfModel:
+    """What a robot looks like, for :func:`vrrt_jax.plan`."""
+
+    robot: str
+    joint_names: tuple[str, ...]
+    levels: tuple[Level, ...]  # by rising size
+    seed: int
+    info: dict[str, Any]  # how it was trained: numbers of images, steps, seconds, versions
+
+    def level_for(self, height_px: int) -> Level:
+        """The coarsest level trained for images at least this high, or the finest."""
+        fitting = [level for level in self.levels if level.size_px >= height_px]
+        return fitting[0] if fitting else self.levels[-1]
+
+
+def save_self_model(model: SelfModel, path: str | Path) -> None:
+    """Write a compressed ``.npz``, atomically."""
+    path = Path(path)
+    header = {
+        "format": FORMAT,
+        "robot": model.robot,
+        "joint_names": list(model.joint_names),
+        "seed": model.seed,
+        "info": model.info,
+        "levels": [
+            {"size_px": v.size_px, "psnr_db": v.psnr_db, "match_bar": v.match_bar}
+            for v in model.levels
+        ],
+    }
+    arrays: dict[str, Any] = {"header": np.array(json.dumps(header))}
+    for i, level in enumerate(model.levels):
+        for name in ARRAYS:
+            value = np.asarray(getattr(level.splats, name))
+            small = np.uint8 if name == "link" else np.float16 if value.ndim else np.float32
+            arrays[f"{i}/{name}"] = value.astype(small)
+    part = path.with_name(path.name + ".part")
+    with open(part, "wb") as file:
+        np.savez_compressed(file, **arrays)
+    part.replace(path)
+
+
+def load_self_model(path: str | Path) -> SelfModel:
+    """Read a self-model.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: the file is truncated, or no self-model, or of another format.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no self-model at '{path}'; train one with: vrrt fit")
+    try:
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in file.files}
+        header = json.loads(str(arrays["header"]))
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(
+            f"'{path}' is not a readable self-model ({error}); train it again with: vrrt fit"
+        ) from None
+    if header.get("format") != FORMAT:
+        raise ValueError(
+            f"'{path}' has self-model format {header.get('format')}, expected {FORMAT}; train it "
+            "again with: vrrt fit"
+        )
+    levels = tuple(
+        Level(
+            splats=SplatModel(
+                **{
+                    name: jnp.asarray(
+                        arrays[f"{i}/{name}"], jnp.int32 if name == "link" else jnp.float32
+                    )
+                    for name in ARRAYS
+                }
+            ),
+            **numbers,
+        )
+        for i, numbers in enumerate(header["levels"])
+    )
+    return SelfModel(
+        robot=header["robot"],
+        joint_names=tuple(header["joint_names"]),
+        levels=levels,
+        seed=header["seed"],
+        info=header["info"],
+    )

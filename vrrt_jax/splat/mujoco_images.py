@@ -1,0 +1,157 @@
+"""Images from MuJoCo's own renderer and a robot's true meshes; no screen is needed."""
+
+import dataclasses
+import weakref
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from vrrt_jax.core.types import Obstacle
+from vrrt_jax.splat.types import Camera
+
+SUPERSAMPLING = 2  # rendered pixels per pixel and axis; the mean of a block is a pixel
+MAX_RENDER_PX = 1024  # larger buffers are slow and some drivers refuse them
+VISUAL_GROUPS = (0, 1, 2)
+OBSTACLE_GROUP = 5
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Picture:
+    """One rendered view."""
+
+    rgb: np.ndarray  # (H, W, 3) float32, the robot over black
+    coverage: np.ndarray  # (H, W) float32
+
+
+class MeshRenderer:
+    """Renders a robot's meshes at given configurations with given cameras.
+
+    The only light sits on the camera, with almost no highlights.
+
+    Args:
+        spec: the robot with its visual meshes; it is compiled here.
+        obstacles: drawn too, by :meth:`scene`.
+    """
+
+    def __init__(self, spec: mujoco.MjSpec, obstacles: Sequence[Obstacle] = ()):
+        """Compile the model; raises RuntimeError if OpenGL is not available."""
+        spec = spec.copy()
+        for obstacle in obstacles:
+            spec.worldbody.add_geom(
+                name=f"obstacle {obstacle.name}",
+                type=getattr(mujoco.mjtGeom, f"mjGEOM_{obstacle.kind.upper()}"),
+                pos=obstacle.position,
+                quat=obstacle.quaternion,
+                size=obstacle.size,
+                rgba=obstacle.rgba,
+                group=OBSTACLE_GROUP,
+            )
+        for light in list(spec.lights):
+            spec.delete(light)
+        headlight = spec.visual.headlight
+        headlight.ambient, headlight.diffuse = [0.35] * 3, [0.6] * 3
+        headlight.specular = [0.02] * 3
+        spec.visual.quality.shadowsize = 0
+        spec.visual.quality.offsamples = 0
+        spec.visual.global_.offwidth = spec.visual.global_.offheight = MAX_RENDER_PX
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
+        weakref.finalize(self, _close, self._renderers)  # also at exit, while OpenGL still works
+        self._option = mujoco.MjvOption()
+        self._option.geomgroup[:] = 0
+        for group in VISUAL_GROUPS:
+            self._option.geomgroup[group] = 1
+
+    def picture(self, q: np.ndarray, camera: Camera) -> Picture:
+        """The robot alone over black, with its exact coverage."""
+        scale = max(1, min(SUPERSAMPLING, MAX_RENDER_PX // max(camera.height, camera.width)))
+        renderer = self._aim(q, camera, scale)
+        rgb = renderer.render().astype(np.float32) / 255.0
+        renderer.enable_segmentation_rendering()
+        mask = renderer.render()[..., 0] >= 0
+        renderer.disable_segmentation_rendering()
+        return Picture(
+            rgb=_block_mean(rgb * mask[..., None], scale),
+            coverage=_block_mean(mask.astype(np.float32), scale),
+        )
+
+    def surface(self, q: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Depth (H, W) [m] along the optical axis, and geom (H, W), -1 for none; no supersampling.
+
+        Leaves ``data`` posed at ``q``.
+        """
+        renderer = self._aim(q, camera, 1)
+        renderer.enable_depth_rendering()
+        depth = renderer.render().copy()
+        renderer.disable_depth_rendering()
+        renderer.enable_segmentation_rendering()
+        segments = renderer.render()
+        renderer.disable_segmentation_rendering()
+        is_geom = segments[..., 1] == mujoco.mjtObj.mjOBJ_GEOM
+        return depth, np.where(is_geom, segments[..., 0], -1)
+
+    def scene(self, q: np.ndarray, camera: Camera) -> np.ndarray:
+        """Robot and obstacles for people to look at: (H, W, 3) uint8."""
+        self._option.geomgroup[OBSTACLE_GROUP] = 1
+        try:
+            scale = max(1, min(2, MAX_RENDER_PX // max(camera.height, camera.width)))
+            renderer = self._aim(q, camera, scale)
+            image = renderer.render().astype(np.float32)
+            renderer.enable_segmentation_rendering()
+            image[renderer.render()[..., 0] < 0] = 250.0
+            renderer.disable_segmentation_rendering()
+        finally:
+            self._option.geomgroup[OBSTACLE_GROUP] = 0
+        return _block_mean(image, scale).astype(np.uint8)
+
+    def _aim(self, q: np.ndarray, camera: Camera, scale: int) -> mujoco.Renderer:
+        size = (camera.height * scale, camera.width * scale)
+        if size not in self._renderers:
+            try:
+                self._renderers[size] = mujoco.Renderer(self.model, *size)
+            except (RuntimeError, mujoco.FatalError) as error:
+                raise RuntimeError(
+                    "OpenGL is not available for rendering meshes "
+                    f"({error}); install libosmesa6 (or libegl1 and libgl1), or set MUJOCO_GL"
+                ) from None
+        renderer = self._renderers[size]
+        self.data.qpos[:] = q
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+        renderer.update_scene(self.data, scene_option=self._option)
+        _set_camera(renderer.scene, camera, self.model)
+        return renderer
+
+
+def _close(renderers: dict[tuple[int, int], mujoco.Renderer]) -> None:
+    for renderer in renderers.values():
+        renderer.close()
+
+
+def _set_camera(scene: mujoco.MjvScene, camera: Camera, model: mujoco.MjModel) -> None:
+    """Give the scene exactly our camera: any pose, focal length and principal point."""
+    world_to_cam = np.asarray(camera.world_to_cam, np.float64)
+    rotation = world_to_cam[:3, :3]
+    eye = -rotation.T @ world_to_cam[:3, 3]
+    focal, (cx, cy) = float(camera.focal), np.asarray(camera.centre, np.float64)
+    # MuJoCo turns its depth buffer into metres with these planes, so they are not ours to choose.
+    near = model.vis.map.znear * model.stat.extent
+    far = model.vis.map.zfar * model.stat.extent
+    for view in scene.camera:
+        view.pos, view.forward, view.up = eye, rotation[2], -rotation[1]
+        view.frustum_near, view.frustum_far = near, far
+        view.frustum_top = near * cy / focal
+        view.frustum_bottom = near * (cy - camera.height) / focal
+        view.frustum_center = near * (camera.width / 2 - cx) / focal
+        view.frustum_width = near * camera.width / 2 / focal
+    for light in scene.lights[: scene.nlight]:
+        if light.headlight:
+            light.pos, light.dir = eye, rotation[2]
+
+
+def _block_mean(image: np.ndarray, scale: int) -> np.ndarray:
+    height, width = image.shape[0] // scale, image.shape[1] // scale
+    blocks = image.reshape(height, scale, width, scale, *image.shape[2:])
+    return blocks.mean(axis=(1, 3)).astype(np.float32)

@@ -1,0 +1,155 @@
+"""Visual-RRT as a policy of the kernel: grow towards what looks like the goal image.
+
+The score of a node is its image loss. Exploiting lanes take one Adam step from a node's stored
+gradient, and the child inherits the moments; exploring lanes take a random step and start afresh.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from vrrt_jax.core.edges import difference
+from vrrt_jax.core.rewire import rewire
+from vrrt_jax.core.rrt import sample_configurations
+from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
+from vrrt_jax.core.world import World
+from vrrt_jax.splat.loss import goal_loss
+from vrrt_jax.splat.raster import map_lanes
+from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
+
+
+@pytree
+class VisualNode:
+    """What Visual-RRT keeps for a node: computed once, when it is inserted."""
+
+    grad: jax.Array  # (N, D) of the image loss
+    adam: optax.ScaleByAdamState  # count (N,), mu (N, D), nu (N, D)
+    exploited: jax.Array  # (N,) bool, its gradient step has been taken or is blocked
+
+
+@pytree
+class VisualPolicy:
+    """Visual-RRT (Lee et al., CVPR 2026); the symbols are the paper's.
+
+    A new goal, camera, self-model of the same size or hyper-parameter never re-compiles.
+    """
+
+    splats: SplatModel
+    cameras: Camera  # leading axis V
+    goal: GoalImage
+    alpha: jax.Array  # () Adam step [rad]
+    epsilon: jax.Array  # () exploration step [rad]
+    kappa: jax.Array  # () decay of the frontier's geometric law
+    eta: jax.Array  # () probability of the frontier's law, against a uniform choice of parent
+    exploration: jax.Array  # () share r of lanes that explore
+    beta1: jax.Array  # ()
+    beta2: jax.Array  # ()
+    anneal_loss: jax.Array  # () loss under which Adam steps shrink with its square root; 0 = never
+    rewire_radius: jax.Array  # () [rad]
+    rewiring: bool = static(default=True)
+    lanes: int = static(default=32)
+    edge_steps: int = static(default=6)
+    rewire_steps: int = static(default=15)
+
+    def loss(self, world: World, q: jax.Array) -> jax.Array:
+        """Image loss () of a configuration (D,)."""
+        return goal_loss(world.chain, self.splats, self.cameras, self.goal, q)
+
+    def root(self, world: World, q: jax.Array) -> tuple[jax.Array, VisualNode]:
+        """Loss and payload of a root."""
+        loss, grad = jax.value_and_grad(self.loss, argnums=1)(world, q)
+        adam = optax.ScaleByAdamState(
+            count=jnp.int32(0), mu=jnp.zeros_like(q), nu=jnp.zeros_like(q)
+        )
+        return loss, VisualNode(grad=grad, adam=adam, exploited=jnp.bool_(False))
+
+    def propose(self, world: World, tree: Tree[VisualNode], key: jax.Array) -> Proposals:
+        """Draw parents from the frontier, then step along the image gradient or at random.
+
+        Nodes are ranked by loss; the node of rank k has probability
+        ``eta (1 - kappa) kappa^k / (1 - kappa^M) + (1 - eta) / M``, drawn without replacement by
+        Gumbel top-k. Exploiting lanes rank and draw only nodes not exploited before, since a second
+        step from the same gradient would repeat the first; where those run out, lanes explore.
+        """
+        key_exploit, key_explore, key_q = jax.random.split(key, 3)
+        order = jnp.argsort(tree.score)
+        filled = jnp.arange(tree.capacity) < tree.size
+        unexploited = filled & ~tree.payload.exploited[order]
+        exploit_parent, has_step = self._draw(unexploited, key_exploit)
+        explore_parent, has_parent = self._draw(filled, key_explore)
+
+        exploits = has_step & (
+            jnp.arange(self.lanes) < jnp.round((1.0 - self.exploration) * self.lanes)
+        )
+        spare = jnp.where(has_parent, explore_parent, explore_parent[0])
+        parent = order[jnp.where(exploits, exploit_parent, spare)].astype(jnp.int32)
+        q = tree.q[parent]
+        node = jax.tree.map(lambda leaf: leaf[parent], tree.payload)
+        step, adam = self._adam_step(world, q, tree.score[parent], node)
+
+        towards = difference(world, q, sample_configurations(world, key_q, self.lanes))
+        norm = jnp.sqrt(jnp.sum(towards**2, axis=-1, keepdims=True))
+        wander = self.epsilon * towards / jnp.maximum(norm, 1e-9)
+        fresh = jax.tree.map(jnp.zeros_like, adam)
+        lanes = exploits[:, None]
+        return Proposals(
+            parent=parent,
+            target=q + jnp.where(lanes, step, wander),
+            ok=jnp.ones(self.lanes, bool),
+            partial=jnp.zeros(self.lanes, bool),
+            carry=(
+                exploits,
+                jax.tree.map(
+                    lambda a, b: jnp.where(exploits if a.ndim == 1 else lanes, a, b), adam, fresh
+                ),
+            ),
+        )
+
+    def _draw(self, allowed: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Places (B,) in the loss order, of nodes that are allowed (N,), and whether there are."""
+        rank = jnp.cumsum(allowed) - 1
+        total = jnp.maximum(jnp.sum(allowed), 1)
+        decay = (1.0 - self.kappa) * self.kappa**rank / (1.0 - self.kappa**total)
+        weight = self.eta * decay + (1.0 - self.eta) / total
+        noise = jax.random.gumbel(key, allowed.shape)
+        logit = jnp.where(allowed, jnp.log(weight + 1e-30) + noise, -jnp.inf)
+        best, place = jax.lax.top_k(logit, self.lanes)
+        return place, best > -jnp.inf
+
+    def _adam_step(self, world: World, q: jax.Array, loss: jax.Array, node: VisualNode):
+        """Steps (B, D) down the image loss, and the moments after them."""
+        adam = optax.scale_by_adam(b1=self.beta1, b2=self.beta2, eps=1e-8)
+        direction, state = jax.vmap(adam.update)(node.grad, node.adam)
+        shrink = jnp.sqrt(jnp.minimum(1.0, loss / jnp.maximum(self.anneal_loss, 1e-12)))
+        step = -self.alpha * shrink[:, None] * direction
+        # Momentum into a limit would only hold the joint there.
+        stuck = ~world.wraps & ((q + step < world.lower) | (q + step > world.upper))
+        return step, state._replace(mu=jnp.where(stuck, 0.0, state.mu))
+
+    def evaluate(self, world: World, q: jax.Array, proposals: Proposals):
+        """Losses (B,) and payloads of the children."""
+        loss, grad = map_lanes(jax.value_and_grad(lambda q: self.loss(world, q)), q)
+        _, adam = proposals.carry
+        return loss, VisualNode(grad=grad, adam=adam, exploited=jnp.zeros(self.lanes, bool))
+
+    def after_insert(
+        self,
+        world: World,
+        tree: Tree[VisualNode],
+        proposals: Proposals,
+        expansion: Expansion,
+    ) -> Tree[VisualNode]:
+        """Mark parents as exploited, also those whose step was blocked; rewire."""
+        exploits, _ = proposals.carry
+        taken = jnp.where(exploits, proposals.parent, tree.capacity)
+        exploited = tree.payload.exploited.at[taken].set(True, mode="drop")
+        tree = dataclasses.replace(
+            tree, payload=dataclasses.replace(tree.payload, exploited=exploited)
+        )
+        if not self.rewiring:
+            return tree
+        return rewire(
+            world, tree, expansion, radius=self.rewire_radius, edge_steps=self.rewire_steps
+        )
