@@ -14,6 +14,8 @@ from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera, SplatModel
 
+_is_free = jax.jit(is_free)
+
 # name: (lowest, highest, is the highest allowed)
 RANGES = {
     "alpha": (0.0, 1.0),
@@ -50,11 +52,11 @@ def check_config(config: Any) -> None:
         )
 
 
-def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.ndarray:
-    """Check a configuration against shape, limits and collision; returns it as float32 (D,).
+def check_limits(robot: Robot, q: Any, what: str) -> np.ndarray:
+    """Check a configuration's shape and limits; returns it as float32 (D,).
 
     Raises:
-        ValueError: names the joint, value and bounds, or the bodies that touch.
+        ValueError: names the joint, its value and its bounds.
     """
     q = np.asarray(q, np.float32)
     names = robot.joint_names
@@ -71,11 +73,21 @@ def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.n
                 f"the {what} is outside the limits: joint '{name}' is at {value:.4f}, its bounds "
                 f"are [{low:.4f}, {high:.4f}]"
             )
-    q = np.where(robot.wraps, q, np.clip(q, robot.lower, robot.upper)).astype(np.float32)
-    if not bool(jax.jit(is_free)(world, jnp.asarray(q))):
-        touching = contacts(robot, obstacle_list(world), q)
-        if not touching:
-            touching = contacts(robot, obstacle_list(world), q, geometry="spheres")
+    return np.where(robot.wraps, q, np.clip(q, robot.lower, robot.upper)).astype(np.float32)
+
+
+def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.ndarray:
+    """Check a configuration against shape, limits and collision; returns it as float32 (D,).
+
+    Raises:
+        ValueError: names the joint, its value and its bounds, or the bodies that touch.
+    """
+    q = check_limits(robot, q, what)
+    if not bool(_is_free(world, jnp.asarray(q))):
+        obstacles = obstacle_list(world)
+        touching = contacts(robot, obstacles, q) or contacts(
+            robot, obstacles, q, geometry="spheres"
+        )
         raise ValueError(
             f"the {what} is in collision: {'; '.join(touching[:4]) or 'within the margin'}; move "
             "the robot or the obstacle"

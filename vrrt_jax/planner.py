@@ -32,6 +32,9 @@ STATUS_OF = {
 }
 
 
+RRT_STAR_RADIUS = 1.9  # [rad] nodes of a sparse tree in seven dimensions lie that far apart
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PlannerConfig:
     """Settings of Visual-RRT; all but the sizes are traced, so changing them never re-compiles.
@@ -98,7 +101,8 @@ class PlanResult:
         times = ", ".join(f"{k.removesuffix('_s')} {v:.1f} s" for k, v in self.timing.items())
         return (
             f"{self.status.name}: loss {self.loss:.2e} (goal {self.goal_loss:.2e}), "
-            f"{len(self.path)} waypoints, {self.cost:.2f} rad, {self.iterations} iterations; {times}"
+            f"{len(self.path)} waypoints, {self.cost:.2f} rad, {self.iterations} iterations; "
+            f"{times}"
         )
 
 
@@ -134,8 +138,8 @@ def plan(
     config = config or PlannerConfig()
     checks.check_config(config)
     q_start = checks.check_start(robot, world, q_start)
-    policy, goal_loss = _visual_policy(robot, self_model, camera, goal_image, q_start, config)
-    tree, compile_s = _timed(_plant, world, policy, jnp.asarray(q_start), config.capacity)
+    policy, goal_loss = visual_policy(robot, self_model, camera, goal_image, q_start, config)
+    tree, compile_s = _timed(plant, world, policy, jnp.asarray(q_start), config.capacity)
     found = search(
         world,
         policy,
@@ -191,7 +195,7 @@ def plan_batch(
     for i, (image, q_start) in enumerate(zip(goal_images, q_starts, strict=True)):
         try:
             starts.append(checks.check_start(robot, world, q_start))
-            policy, loss = _visual_policy(robot, self_model, camera, image, starts[-1], config)
+            policy, loss = visual_policy(robot, self_model, camera, image, starts[-1], config)
         except ValueError as error:
             raise ValueError(f"problem {i}: {error}") from None
         policies.append(policy)
@@ -199,7 +203,7 @@ def plan_batch(
     policies = _stack(policies)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(starts)))
     started = time.perf_counter()
-    plants = jax.vmap(_plant, (None, 0, 0, None))
+    plants = jax.vmap(plant, (None, 0, 0, None))
     tree = jax.block_until_ready(
         plants(world, policies, jnp.asarray(np.stack(starts)), config.capacity)
     )
@@ -263,7 +267,7 @@ def plan_to_configuration(
         policy = RRT(
             goal=goal,
             goal_bias=jnp.float32(goal_bias),
-            rewire_radius=jnp.float32(2 * config.rewire_radius),
+            rewire_radius=jnp.float32(RRT_STAR_RADIUS),
             star=planner == "rrt-star",
             lanes=config.lanes,
         )
@@ -292,7 +296,7 @@ def plan_to_configuration(
     return _finish(robot, world, found, path, loss, max(stop_score, 1e-4), key, config)
 
 
-def _visual_policy(
+def visual_policy(
     robot: Robot,
     self_model: SelfModel,
     camera: Camera | Sequence[Camera],
@@ -331,7 +335,8 @@ def _visual_policy(
     return policy, goal_loss
 
 
-def _plant(world: World, policy: VisualPolicy, q_start: jax.Array, capacity: int) -> Tree:
+def plant(world: World, policy: VisualPolicy, q_start: jax.Array, capacity: int) -> Tree:
+    """A visual tree of ``capacity`` slots with its root at ``q_start`` (D,)."""
     score, payload = _root(world, policy, q_start)
     roots = jax.tree.map(lambda leaf: leaf[None], (q_start, score, payload))
     return trees.create(*roots, capacity)

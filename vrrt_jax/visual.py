@@ -16,7 +16,15 @@ from vrrt_jax.core.rrt import sample_configurations
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
 from vrrt_jax.core.world import World
 from vrrt_jax.splat.loss import goal_loss
-from vrrt_jax.splat.raster import map_lanes
+
+try:
+    from vrrt_jax.splat.raster import map_lanes
+except ImportError:
+
+    def map_lanes(f, *a):
+        return jax.lax.map(lambda x: f(*x), a, batch_size=4)
+
+
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
 
 

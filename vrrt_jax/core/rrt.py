@@ -35,6 +35,7 @@ class RRT:
     star: bool = static(default=False)
     lanes: int = static(default=32)
     edge_steps: int = static(default=32)
+    rewire_steps: int = static(default=96)  # longer than a step: near is far in seven dimensions
 
     def root(self, world: World, q: jax.Array) -> tuple[jax.Array, None]:
         """Score of a root; there is no payload."""
@@ -66,7 +67,9 @@ class RRT:
         """Rewire, if this is RRT*."""
         if not self.star:
             return tree
-        return rewire(world, tree, expansion, radius=self.rewire_radius, edge_steps=self.edge_steps)
+        return rewire(
+            world, tree, expansion, radius=self.rewire_radius, edge_steps=self.rewire_steps
+        )
 
 
 @pytree

@@ -46,12 +46,45 @@ def look_at(
     world_to_cam[:3, :3] = rotation
     world_to_cam[:3, 3] = -rotation @ eye_
     focal = 0.5 * height / np.tan(np.radians(fovy_deg) / 2)
+    return camera_from_matrix(world_to_cam, focal=float(focal), height=height, width=width)
+
+
+def camera_from_matrix(
+    world_to_cam: np.ndarray,
+    *,
+    focal: float,
+    height: int,
+    width: int,
+    centre: Sequence[float] | None = None,
+) -> Camera:
+    """A calibrated camera.
+
+    Args:
+        world_to_cam: (4, 4) rigid transform; the camera looks along +z, x right, y down.
+        focal: focal length [px].
+        height: image height [px].
+        width: image width [px].
+        centre: principal point x, y [px]; the middle of the image if None.
+
+    Raises:
+        ValueError: the matrix is not rigid, or a size is not positive.
+    """
+    world_to_cam = np.asarray(world_to_cam, np.float64)
+    rotation = world_to_cam[:3, :3] if world_to_cam.shape == (4, 4) else np.zeros((3, 3))
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise ValueError(
+            "world_to_cam is not a rigid (4, 4) transform; its upper left 3 x 3 block must be a "
+            "rotation"
+        )
+    if not (focal > 0 and height > 0 and width > 0):
+        raise ValueError(f"focal={focal}, height={height}, width={width}; all must be positive")
+    centre = (width / 2, height / 2) if centre is None else centre
     return Camera(
         world_to_cam=jnp.asarray(world_to_cam, jnp.float32),
         focal=jnp.float32(focal),
-        centre=jnp.asarray([width / 2, height / 2], jnp.float32),
-        height=height,
-        width=width,
+        centre=jnp.asarray(centre, jnp.float32),
+        height=int(height),
+        width=int(width),
     )
 
 

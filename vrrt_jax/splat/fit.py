@@ -41,7 +41,7 @@ class LevelConfig:
 class FitConfig:
     """How a self-model is trained."""
 
-    num_images: int = 500
+    num_images: int = 400
     num_surface_images: int = 150  # of them, those with depth, to place the splats
     num_validation: int = 60
     image_px: int = 256
@@ -50,10 +50,10 @@ class FitConfig:
     elevation_deg: tuple[float, float] = (-75.0, 5.0)
     target: tuple[float, float, float] = (0.0, 0.0, 0.4)  # [m]
     target_spread: float = 0.15  # [m]
-    learning_rate: float = 0.02
+    learning_rate: float = 0.1
     levels: tuple[LevelConfig, ...] = (
-        LevelConfig(num_splats=300, size_px=32, steps=1500, batch=8),
-        LevelConfig(num_splats=600, size_px=64, steps=1500, batch=8),
+        LevelConfig(num_splats=300, size_px=32, steps=1000, batch=8),
+        LevelConfig(num_splats=600, size_px=64, steps=1500, batch=6),
         LevelConfig(num_splats=5000, size_px=256, steps=300, batch=2),
     )
 
@@ -269,7 +269,7 @@ def initial_splats(points: np.ndarray, num_splats: int, seed: int) -> SplatModel
     return SplatModel(
         mean=jnp.asarray(mean, jnp.float32),
         radius=jnp.asarray(radius, jnp.float32),
-        density=jnp.full(num_splats, 3.0),
+        density=jnp.full(num_splats, 3.0, jnp.float32),
         rgb=jnp.asarray(rgb, jnp.float32),
         shade=jnp.zeros((num_splats, 3)),
         link=jnp.asarray(link, jnp.int32),

@@ -64,6 +64,10 @@ class MeshRenderer:
         for group in VISUAL_GROUPS:
             self._option.geomgroup[group] = 1
 
+    def check(self) -> None:
+        """Raise a RuntimeError if OpenGL is not available."""
+        self._renderer((8, 8))
+
     def picture(self, q: np.ndarray, camera: Camera) -> Picture:
         """The robot alone over black, with its exact coverage."""
         scale = max(1, min(SUPERSAMPLING, MAX_RENDER_PX // max(camera.height, camera.width)))
@@ -107,7 +111,15 @@ class MeshRenderer:
         return _block_mean(image, scale).astype(np.uint8)
 
     def _aim(self, q: np.ndarray, camera: Camera, scale: int) -> mujoco.Renderer:
-        size = (camera.height * scale, camera.width * scale)
+        renderer = self._renderer((camera.height * scale, camera.width * scale))
+        self.data.qpos[:] = q
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+        renderer.update_scene(self.data, scene_option=self._option)
+        _set_camera(renderer.scene, camera, self.model)
+        return renderer
+
+    def _renderer(self, size: tuple[int, int]) -> mujoco.Renderer:
         if size not in self._renderers:
             try:
                 self._renderers[size] = mujoco.Renderer(self.model, *size)
@@ -116,13 +128,7 @@ class MeshRenderer:
                     "OpenGL is not available for rendering meshes "
                     f"({error}); install libosmesa6 (or libegl1 and libgl1), or set MUJOCO_GL"
                 ) from None
-        renderer = self._renderers[size]
-        self.data.qpos[:] = q
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_camlight(self.model, self.data)
-        renderer.update_scene(self.data, scene_option=self._option)
-        _set_camera(renderer.scene, camera, self.model)
-        return renderer
+        return self._renderers[size]
 
 
 def _close(renderers: dict[tuple[int, int], mujoco.Renderer]) -> None:

@@ -1,0 +1,52 @@
+"""Shared fixtures: one robot, one world and few compiled functions for all files."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import vrrt_jax
+
+# Compiled programs survive between runs and are shared by pytest-xdist's workers.
+jax.config.update("jax_compilation_cache_dir", str(Path.home() / ".cache" / "vrrt_jax_tests"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+@pytest.fixture(scope="session")
+def panda():
+    return vrrt_jax.load_robot("panda")
+
+
+@pytest.fixture(scope="session")
+def wall_world(panda):
+    """Something of every kind, with a wall between the two sides of the robot."""
+    obstacles = [
+        vrrt_jax.Obstacle(name="floor", kind="plane", position=(0, 0, -0.01), size=(1, 1, 0.1)),
+        vrrt_jax.Obstacle(
+            name="wall", kind="box", position=(0.45, 0.0, 0.4), size=(0.25, 0.02, 0.4)
+        ),
+        vrrt_jax.Obstacle(name="ball", kind="sphere", position=(-0.4, 0.3, 0.6), size=(0.1, 0, 0)),
+        vrrt_jax.Obstacle(
+            name="post", kind="cylinder", position=(-0.2, -0.5, 0.4), size=(0.05, 0.4, 0)
+        ),
+        vrrt_jax.Obstacle(
+            name="pipe",
+            kind="capsule",
+            position=(0.0, 0.45, 0.9),
+            quaternion=(0.7071, 0.7071, 0, 0),
+            size=(0.04, 0.2, 0),
+        ),
+    ]
+    return vrrt_jax.build_world(panda, obstacles)
+
+
+@pytest.fixture(scope="session")
+def free(wall_world):
+    """A compiled ``(world, q (n, D)) -> (n,)``."""
+    return jax.jit(jax.vmap(vrrt_jax.is_free, (None, 0)))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)

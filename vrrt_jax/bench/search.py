@@ -1,0 +1,110 @@
+"""The visual search: what an iteration costs, and the packaged problems from start to end."""
+
+import dataclasses
+import resource
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax import planner
+from vrrt_jax.bench.timing import interleaved_ms
+from vrrt_jax.core.edges import free_steps
+from vrrt_jax.core.expand import expand
+from vrrt_jax.core.search import make_stop, search
+from vrrt_jax.core.types import Expansion
+from vrrt_jax.problems import Problem, load_problem, problem_names
+
+
+def run(repeats: int = 15, seeds: int = 3) -> dict:
+    """The split of one iteration, and the outcome of every packaged problem for several seeds."""
+    problems = {name: load_problem(name) for name in problem_names()}
+    split = iteration_split(next(iter(problems.values())), repeats)
+    outcomes = {name: _outcome(problem, seeds) for name, problem in problems.items()}
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {**split, "problems": outcomes, "peak_memory_mb": round(peak_mb)}
+
+
+def iteration_split(problem: Problem, repeats: int = 15) -> dict:
+    """Times of the parts of one iteration on a grown tree, each jitted by itself [ms]."""
+    config = planner.PlannerConfig()
+    policy, _ = planner.visual_policy(
+        problem.robot,
+        problem.self_model,
+        problem.cameras,
+        problem.goal_images,
+        problem.q_start,
+        config,
+    )
+    world, key = problem.world, jax.random.key(0)
+    tree = planner.plant(world, policy, jnp.asarray(problem.q_start), config.capacity)
+    found = search(
+        world, policy, tree, key=key, stop=make_stop(-1.0, max_iterations=40), time_limit_s=60.0
+    )
+    tree = found.tree
+    proposals = jax.jit(policy.propose)(world, tree, key)
+    parents = tree.q[proposals.parent]
+    size = tree.size - policy.lanes
+    expansion = Expansion(
+        q=tree.q[size + jnp.arange(policy.lanes)],
+        slot=(size + jnp.arange(policy.lanes)).astype(jnp.int32),
+        accepted=jnp.ones(policy.lanes, bool),
+        blocked=jnp.zeros(policy.lanes, bool),
+    )
+    # The arrays are arguments, as in the search: a closure would make them constants.
+    parts = {
+        "iteration": (expand, (world, policy, tree, key)),
+        "gradient": (lambda p, w, *rest: p.evaluate(w, *rest), (policy, world, parents, proposals)),
+        "propose": (lambda p, *rest: p.propose(*rest), (policy, world, tree, key)),
+        "edges": (
+            lambda w, a, b: free_steps(w, a, b, policy.edge_steps),
+            (world, parents, proposals.target - parents),
+        ),
+        "rewire": (
+            lambda p, *rest: p.after_insert(*rest),
+            (policy, world, tree, proposals, expansion),
+        ),
+    }
+    compiled = {name: (jax.jit(function), args) for name, (function, args) in parts.items()}
+    times = interleaved_ms(
+        {name: lambda f=f, args=args: f(*args) for name, (f, args) in compiled.items()}, repeats
+    )
+    return {
+        "lanes": policy.lanes,
+        "num_splats": policy.splats.num_splats,
+        "image_px": list(policy.goal.coverage.shape[1:]),
+        "capacity": config.capacity,
+        "tree_nodes": int(tree.size),
+        **{f"{name}_ms": round(value, 2) for name, value in times.items()},
+        "iteration_over_gradient": round(times["iteration"] / times["gradient"], 3),
+        "ms_per_iteration_in_search": round(1e3 * found.search_s / max(int(tree.iteration), 1), 2),
+        "compile_s": round(found.compile_s, 2),
+    }
+
+
+def _outcome(problem: Problem, seeds: int) -> dict:
+    rows = []
+    for seed in range(seeds):
+        result = planner.plan(
+            problem.robot,
+            problem.world,
+            problem.self_model,
+            problem.cameras,
+            problem.goal_images,
+            problem.q_start,
+            key=jax.random.key(seed),
+            config=dataclasses.replace(planner.PlannerConfig(), time_limit_s=60.0),
+        )
+        error = np.nan
+        if problem.true_goal is not None:
+            error = float(np.abs(result.q_goal - problem.true_goal).mean())
+        rows.append((result.ok, result.timing["search_s"], error, result.cost, result.iterations))
+    table = np.array(rows, float)
+    return {
+        "n": seeds,
+        "solved": float(table[:, 0].mean()),
+        "search_s": np.round(table[:, 1], 2).tolist(),
+        "mean_error_rad": np.round(table[:, 2], 4).tolist(),
+        "cost_rad": np.round(table[:, 3], 2).tolist(),
+        "iterations": table[:, 4].astype(int).tolist(),
+    }

@@ -1,0 +1,36 @@
+"""Timing on a machine that others use too: the best of many, everything in one process."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+
+def best_ms(function: Callable, *args: Any, repeats: int = 30) -> tuple[float, float]:
+    """Smallest time of a call after the first [ms], and the time of the first call [s].
+
+    Machines are shared and noisy: the smallest of many is what the code itself costs.
+    """
+    started = time.perf_counter()
+    jax.block_until_ready(function(*args))
+    first_s = time.perf_counter() - started
+    times = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        jax.block_until_ready(function(*args))
+        times.append(time.perf_counter() - started)
+    return 1e3 * min(times), first_s
+
+
+def interleaved_ms(functions: dict[str, Callable[[], Any]], repeats: int = 30) -> dict[str, float]:
+    """Smallest times [ms] of several calls taken in turn, so that noise hits all alike."""
+    for call in functions.values():
+        jax.block_until_ready(call())
+    best = dict.fromkeys(functions, float("inf"))
+    for _ in range(repeats):
+        for name, call in functions.items():
+            started = time.perf_counter()
+            jax.block_until_ready(call())
+            best[name] = min(best[name], 1e3 * (time.perf_counter() - started))
+    return best

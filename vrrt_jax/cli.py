@@ -1,0 +1,319 @@
+"""The ``vrrt`` command: plan, render, fit, spheres, bench."""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+EXIT_SOLVED, EXIT_UNSOLVED, EXIT_BAD_INPUT = 0, 1, 2
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code: 0 solved or done, 1 not solved, 2 bad input."""
+    arguments = _parser().parse_args(argv)
+    _use_compilation_cache()
+    try:
+        return arguments.run(arguments)
+    except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
+        print(f"vrrt {arguments.command}: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="vrrt", description="From a picture of the goal to a verified, collision-free path."
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+
+    plan = commands.add_parser("plan", help="plan a packaged problem, or one of your own")
+    plan.set_defaults(run=_plan)
+    plan.add_argument("--problem", help="a packaged problem, or a folder with problem.json")
+    _add_robot(plan, required=False)
+    plan.add_argument("--world", help="an MJCF file of obstacles, or a packaged world")
+    plan.add_argument("--goal", nargs="+", help="goal images, RGB with mask or plain background")
+    plan.add_argument("--camera", nargs="+", help="a JSON file for each goal image")
+    plan.add_argument("--start", type=_numbers, help="start configuration, as 0,0.3,...")
+    plan.add_argument("--self-model", help="trained .npz; the robot's own by default")
+    plan.add_argument("--seed", type=int, default=0)
+    plan.add_argument("--time-limit", type=float, default=60.0, help="of the search [s]")
+    plan.add_argument("--paper", action="store_true", help="the published settings")
+    plan.add_argument("--capacity", type=int, help="nodes of the tree")
+    plan.add_argument("--out", default="out", help="folder for the results")
+    plan.add_argument("--no-pictures", action="store_true", help="no figure and no animation")
+
+    render = commands.add_parser("render", help="make a goal image with MuJoCo's renderer")
+    render.set_defaults(run=_render)
+    _add_robot(render)
+    render.add_argument("--q", type=_numbers, required=True, help="configuration, as 0,0.3,...")
+    render.add_argument("--camera", required=True, help="a JSON file")
+    render.add_argument("--size", type=_size, default=(480, 480), help="WIDTHxHEIGHT [px]")
+    render.add_argument("--out", required=True, help="a .png file")
+
+    fit = commands.add_parser("fit", help="train a robot's self-model")
+    fit.set_defaults(run=_fit)
+    _add_robot(fit)
+    fit.add_argument("--out", required=True, help="a .npz file")
+    fit.add_argument("--seed", type=int, default=0)
+    fit.add_argument("--images", type=int, help="number of training images")
+
+    spheres = commands.add_parser("spheres", help="fit collision spheres to a robot's meshes")
+    spheres.set_defaults(run=_spheres)
+    _add_robot(spheres)
+    spheres.add_argument("--out", help="the MJCF file to write; only measured without it")
+    spheres.add_argument("--seed", type=int, default=0)
+    spheres.add_argument("--num", type=int, default=10_000, help="configurations to measure on")
+
+    bench = commands.add_parser("bench", help="measure on this machine")
+    bench.set_defaults(run=_bench)
+    bench.add_argument("what", choices=("kinematics", "raster", "search"))
+    bench.add_argument("--json", help="write the figures here")
+    return parser
+
+
+def _add_robot(parser: argparse.ArgumentParser, required: bool = True) -> None:
+    parser.add_argument(
+        "--robot", required=required, help="a packaged robot, or an MJCF or URDF file"
+    )
+    parser.add_argument(
+        "--freeze", type=_joint_values, default=None, help="joints to fix, as name=0.04,name=0.04"
+    )
+
+
+def _plan(arguments: argparse.Namespace) -> int:
+    import jax
+    from tqdm import tqdm
+
+    import vrrt_jax
+    from vrrt_jax import report
+
+    out = _writable(arguments.out)
+    problem = _problem(arguments)
+    changes: dict[str, Any] = {"time_limit_s": arguments.time_limit}
+    if arguments.capacity is not None:
+        changes["capacity"] = arguments.capacity
+    make = vrrt_jax.PlannerConfig.paper if arguments.paper else vrrt_jax.PlannerConfig
+    config = make(**changes)
+    print(f"{problem.name}: {problem.robot.name}, seed {arguments.seed}; compiling ...", flush=True)
+    with tqdm(total=config.max_iterations, unit="it", disable=None, leave=False) as bar:
+
+        def on_progress(state, seconds):
+            bar.n = int(state.tree.iteration)
+            best, nodes = float(state.tree.score.min()), int(state.tree.size)
+            bar.set_postfix_str(f"best loss {best:.2e}, {nodes} nodes")
+
+        result = vrrt_jax.plan(
+            problem.robot,
+            problem.world,
+            problem.self_model,
+            problem.cameras,
+            problem.goal_images,
+            problem.q_start,
+            key=jax.random.key(arguments.seed),
+            config=config,
+            on_progress=on_progress,
+        )
+    print(result)
+    report.save_result(problem, result, config, arguments.seed, out)
+    if not arguments.no_pictures:
+        _pictures(problem, result, out)
+    if not result.ok:
+        print(f"{result.status.name}: {result.status.value}", file=sys.stderr)
+    return EXIT_SOLVED if result.ok else EXIT_UNSOLVED
+
+
+def _pictures(problem, result, out: Path) -> None:
+    from vrrt_jax import viz
+
+    written = ["result.json", "path.npz"]
+    try:
+        viz.save_figure(problem, result, out / "figure.png")
+        written.append("figure.png")
+    except ModuleNotFoundError:
+        print("no figure: matplotlib is missing; pip install 'vrrt-jax[plot]'", file=sys.stderr)
+    viz.save_animation(problem, result, out / "animation.gif")
+    print(f"wrote {', '.join([*written, 'animation.gif'])} to {out}")
+
+
+def _problem(arguments: argparse.Namespace):
+    from vrrt_jax import problems
+    from vrrt_jax.robots import load_robot
+    from vrrt_jax.splat.goal import read_image
+    from vrrt_jax.splat.model import load_self_model
+
+    parts = ("robot", "world", "goal", "camera", "start")
+    given = [name for name in parts if getattr(arguments, name) is not None]
+    if arguments.problem is not None:
+        if given:
+            raise ValueError(f"give either --problem or --{', --'.join(given)}, not both")
+        return problems.load_problem(arguments.problem)
+    missing = [name for name in parts if name not in given]
+    if missing:
+        raise ValueError(
+            f"missing --{', --'.join(missing)}; or give --problem with one of "
+            f"{', '.join(problems.problem_names())}"
+        )
+    if len(arguments.goal) != len(arguments.camera):
+        raise ValueError(
+            f"{len(arguments.goal)} goal images but {len(arguments.camera)} cameras; give as many"
+        )
+    robot = load_robot(arguments.robot, freeze=arguments.freeze)
+    images = tuple(read_image(path) for path in arguments.goal)
+    return problems.Problem(
+        name=Path(arguments.goal[0]).stem,
+        robot=robot,
+        world=problems.load_world(arguments.world, robot),
+        self_model=load_self_model(problems.self_model_path(robot, arguments.self_model)),
+        cameras=tuple(
+            problems.camera_from_dict(problems.read_json(path), image.shape[:2])
+            for path, image in zip(arguments.camera, images, strict=True)
+        ),
+        goal_images=images,
+        q_start=arguments.start,
+        true_goal=None,
+    )
+
+
+def _render(arguments: argparse.Namespace) -> int:
+    import numpy as np
+
+    from vrrt_jax import checks, problems
+    from vrrt_jax.robots import load_robot
+    from vrrt_jax.splat.goal import write_image
+    from vrrt_jax.splat.mujoco_images import MeshRenderer
+
+    robot = load_robot(arguments.robot, freeze=arguments.freeze)
+    width, height = arguments.size
+    camera = problems.camera_from_dict(problems.read_json(arguments.camera), (height, width))
+    q = checks.check_limits(robot, np.array(arguments.q), "configuration")
+    picture = MeshRenderer(_meshes(robot)).picture(q, camera)
+    if not picture.coverage.any():
+        raise ValueError("the camera does not see the robot at this configuration; nothing written")
+    write_image(arguments.out, picture.rgb, picture.coverage)
+    print(f"wrote {arguments.out}")
+    return EXIT_SOLVED
+
+
+def _fit(arguments: argparse.Namespace) -> int:
+    import dataclasses
+
+    from vrrt_jax.robots import load_robot
+    from vrrt_jax.splat.fit import FitConfig, fit_self_model
+
+    robot = load_robot(arguments.robot, freeze=arguments.freeze)
+    config = FitConfig()
+    if arguments.images is not None:
+        config = dataclasses.replace(config, num_images=arguments.images)
+    _writable(Path(arguments.out).parent)
+    model = fit_self_model(robot, _meshes(robot), arguments.out, seed=arguments.seed, config=config)
+    for level in model.levels:
+        print(
+            f"{level.splats.num_splats} splats at {level.size_px} px: {level.psnr_db:.1f} dB on "
+            f"{model.info['num_validation']} unseen poses and cameras, match bar "
+            f"{level.match_bar:.3g} of the covered share"
+        )
+    print(f"wrote {arguments.out} after {model.info['seconds']:.0f} s, seed {model.seed}")
+    return EXIT_SOLVED
+
+
+def _spheres(arguments: argparse.Namespace) -> int:
+    from vrrt_jax.robots import load_robot
+    from vrrt_jax.robots.fit import fit_spheres
+    from vrrt_jax.robots.measure import measure_spheres
+
+    robot = load_robot(arguments.robot, freeze=arguments.freeze)
+    if arguments.out is not None:
+        _writable(Path(arguments.out).parent)
+        Path(arguments.out).write_text(fit_spheres(robot, seed=arguments.seed, progress=print))
+        print(f"wrote {arguments.out}")
+        robot = load_robot(arguments.out)
+    measured = measure_spheres(robot, num=arguments.num, seed=arguments.seed)
+    print(f"{len(robot.cover.radius)} covering and {len(robot.thin.radius)} thin spheres")
+    for name, counts in (
+        ("against obstacles", measured.obstacles),
+        ("against itself", measured.self_collision),
+    ):
+        print(
+            f"{name}: {counts.misses} of {counts.colliding} collisions missed, "
+            f"{counts.false_alarms} false alarms in {counts.free} free configurations "
+            f"({100 * counts.false_alarm_rate:.2f} %)"
+        )
+    return EXIT_SOLVED
+
+
+def _meshes(robot):
+    from vrrt_jax.robots.sources import mesh_spec
+
+    spec = mesh_spec(robot)
+    if spec is None:
+        raise ValueError(
+            f"the meshes of '{robot.name}' are not on this machine; pip install "
+            "'vrrt-jax[meshes]', or set MENAGERIE_ROOT to a checkout of MuJoCo Menagerie"
+        )
+    return spec
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    import importlib
+
+    figures = importlib.import_module(f"vrrt_jax.bench.{arguments.what}").run()
+    text = json.dumps(figures, indent=2)
+    print(text)
+    if arguments.json:
+        Path(arguments.json).write_text(text + "\n")
+    return EXIT_SOLVED
+
+
+def _writable(folder: str | Path) -> Path:
+    """The folder, made if need be; an error before any work if it cannot be written to."""
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OSError(
+            f"cannot write to the folder '{folder}': {error.strerror}; choose another with --out"
+        ) from None
+    return folder
+
+
+def _use_compilation_cache() -> None:
+    """Keep compiled programs between runs, unless the user has said where or not at all."""
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", str(home / "vrrt_jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+def _numbers(text: str):
+    import numpy as np
+
+    try:
+        return np.array([float(part) for part in text.split(",")], np.float32)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a list such as 0,0.3,-1.2") from None
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a size such as 480x480")
+    return int(width), int(height)
+
+
+def _joint_values(text: str) -> dict[str, float]:
+    try:
+        return {k: float(v) for k, v in (part.split("=") for part in text.split(","))}
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a list such as finger=0.04") from None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

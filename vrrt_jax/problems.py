@@ -1,0 +1,164 @@
+"""Planning problems as folders: ``problem.json`` and the goal images beside it."""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vrrt_jax.core.obstacles import load_obstacles
+from vrrt_jax.core.world import World, build_world
+from vrrt_jax.robots import Robot, load_robot, scenes_dir
+from vrrt_jax.splat.camera import camera_from_matrix, look_at
+from vrrt_jax.splat.goal import read_image
+from vrrt_jax.splat.model import SelfModel, load_self_model
+from vrrt_jax.splat.types import Camera
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Problem:
+    """All that :func:`vrrt_jax.plan` needs."""
+
+    name: str
+    robot: Robot
+    world: World
+    self_model: SelfModel
+    cameras: tuple[Camera, ...]
+    goal_images: tuple[np.ndarray, ...]  # (H, W, 3 or 4) float32
+    q_start: np.ndarray  # (D,)
+    true_goal: np.ndarray | None  # (D,) for scoring alone; the planner never sees it
+
+
+def problem_names() -> list[str]:
+    """The packaged problems."""
+    return sorted(p.parent.name for p in (scenes_dir() / "problems").glob("*/problem.json"))
+
+
+def load_problem(name_or_path: str | Path) -> Problem:
+    """Load a packaged problem by name, or any by its folder.
+
+    Raises:
+        FileNotFoundError: there is no such problem, or one of its files is missing.
+        ValueError: a file is damaged or a field is missing.
+    """
+    folder = Path(name_or_path)
+    if not folder.is_dir() and str(name_or_path) in problem_names():
+        folder = scenes_dir() / "problems" / str(name_or_path)
+    file = folder / "problem.json"
+    if not file.is_file():
+        raise FileNotFoundError(
+            f"no problem at '{name_or_path}'; packaged ones: {', '.join(problem_names())}, or give "
+            "a folder with a problem.json"
+        )
+    fields = read_json(file)
+    try:
+        robot = load_robot(fields["robot"])
+        views = fields["views"]
+        images = tuple(read_image(folder / view["image"]) for view in views)
+        cameras = tuple(
+            camera_from_dict(view["camera"], image.shape[:2])
+            for view, image in zip(views, images, strict=True)
+        )
+        return Problem(
+            name=folder.resolve().name,
+            robot=robot,
+            world=load_world(folder / fields["world"], robot),
+            self_model=load_self_model(self_model_path(robot, fields.get("self_model"))),
+            cameras=cameras,
+            goal_images=images,
+            q_start=_vector(fields["start"], "start"),
+            true_goal=_vector(fields["true_goal"], "true_goal") if "true_goal" in fields else None,
+        )
+    except KeyError as error:
+        raise ValueError(f"'{file}' lacks the field {error}; see the packaged problems") from None
+
+
+def load_world(name_or_path: str | Path, robot: Robot, **settings: Any) -> World:
+    """Load a world of obstacles from an MJCF file, or a packaged one by name, for a robot.
+
+    Args:
+        name_or_path: a file, or the name of one in ``scenes/worlds``.
+        robot: from :func:`load_robot`.
+        settings: passed on to :func:`build_world`.
+
+    Raises:
+        FileNotFoundError: no such world.
+        ValueError: the file is no MJCF, or holds what cannot be collided with.
+    """
+    path = Path(name_or_path)
+    packaged = scenes_dir() / "worlds" / f"{name_or_path}.xml"
+    if not path.is_file() and packaged.is_file():
+        path = packaged
+    if not path.is_file():
+        names = sorted(p.stem for p in (scenes_dir() / "worlds").glob("*.xml"))
+        raise FileNotFoundError(
+            f"no world at '{name_or_path}'; packaged ones: {', '.join(names)}, or give an MJCF file"
+        )
+    return build_world(robot, load_obstacles(path), **settings)
+
+
+def self_model_path(robot: Robot, given: str | Path | None = None) -> Path:
+    """Where a robot's self-model is: the given file, or the packaged one."""
+    if given is not None:
+        return Path(given)
+    return scenes_dir() / "robots" / robot.name / "self_model.npz"
+
+
+def camera_from_dict(fields: Mapping[str, Any], size: tuple[int, ...]) -> Camera:
+    """A camera from JSON, for images of a size (H, W).
+
+    Either ``position``, ``target`` and ``fovy_deg`` (and ``up``), or ``world_to_cam`` (4 x 4),
+    ``focal`` [px] and, unless it is in the middle, ``centre`` [px].
+
+    Raises:
+        ValueError: a field is missing or not a number.
+    """
+    height, width = size
+    try:
+        if "world_to_cam" in fields:
+            return camera_from_matrix(
+                np.array(fields["world_to_cam"], np.float64),
+                focal=float(fields["focal"]),
+                centre=fields.get("centre"),
+                height=height,
+                width=width,
+            )
+        return look_at(
+            fields["position"],
+            fields["target"],
+            fovy_deg=float(fields["fovy_deg"]),
+            up=fields.get("up", (0.0, 0.0, 1.0)),
+            height=height,
+            width=width,
+        )
+    except KeyError as error:
+        raise ValueError(
+            f"the camera lacks the field {error}; give position, target and fovy_deg, or "
+            "world_to_cam and focal"
+        ) from None
+    except TypeError as error:
+        raise ValueError(f"the camera has a field that is not a number: {error}") from None
+
+
+def read_json(path: str | Path) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not JSON, or truncated.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FileNotFoundError(f"cannot read '{path}': {error.strerror}") from None
+    except ValueError as error:
+        raise ValueError(f"'{path}' is not valid JSON: {error}") from None
+
+
+def _vector(values: Sequence[float], what: str) -> np.ndarray:
+    try:
+        return np.array(values, np.float32).reshape(-1)
+    except (TypeError, ValueError):
+        raise ValueError(f"{what} is {values!r}; expected a list of numbers") from None

@@ -1,0 +1,82 @@
+"""Results as files."""
+
+import dataclasses
+import json
+import os
+import platform
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import vrrt_jax
+from vrrt_jax.planner import PlannerConfig, PlanResult
+from vrrt_jax.problems import Problem
+
+
+def summary(
+    problem: Problem, result: PlanResult, config: PlannerConfig, seed: int
+) -> dict[str, Any]:
+    """All that there is to say about a plan, ready for JSON."""
+    check = result.verification
+    fields: dict[str, Any] = {
+        "problem": problem.name,
+        "robot": problem.robot.name,
+        "status": result.status.name,
+        "advice": result.status.value,
+        "verified": bool(check is not None and check.ok),
+        "verified_with": check.geometry if check is not None else None,
+        "contact": check.contact if check is not None else None,
+        "clearance_m": _number(check.clearance) if check is not None else None,
+        "loss": result.loss,
+        "goal_loss": result.goal_loss,
+        "cost": result.cost,
+        "raw_cost": float(np.linalg.norm(np.diff(result.raw_path, axis=0), axis=1).sum()),
+        "q_goal": [round(float(v), 6) for v in result.q_goal],
+        "timing": {name: round(value, 4) for name, value in result.timing.items()},
+        "counts": {
+            "iterations": result.iterations,
+            "nodes": int(result.tree.size),
+            "waypoints": len(result.path),
+            "rejected": dict(result.rejected),
+        },
+        "seed": seed,
+        "config": {k: _number(v) for k, v in dataclasses.asdict(config).items()},
+        "versions": versions(),
+    }
+    if problem.true_goal is not None:
+        error = np.abs(result.q_goal - problem.true_goal)
+        fields["error_rad"] = {"mean": float(error.mean()), "max": float(error.max())}
+    return fields
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the result depends on."""
+    names = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "optax", "numpy")
+    found = {name: metadata.version(name) for name in names}
+    return {"vrrt-jax": vrrt_jax.__version__, "python": platform.python_version(), **found}
+
+
+def save_result(
+    problem: Problem, result: PlanResult, config: PlannerConfig, seed: int, folder: Path
+) -> None:
+    """Write ``result.json`` and ``path.npz`` into a folder, each at once or not at all."""
+    arrays = {
+        "path": result.path,
+        "raw_path": result.raw_path,
+        "history": result.history,
+        "joint_names": np.array(problem.robot.joint_names),
+    }
+    part = folder / ".path.npz.part"
+    with open(part, "wb") as file:
+        np.savez_compressed(file, **arrays)
+    os.replace(part, folder / "path.npz")
+    part = folder / ".result.json.part"
+    part.write_text(json.dumps(summary(problem, result, config, seed), indent=2) + "\n")
+    os.replace(part, folder / "result.json")
+
+
+def _number(value: Any) -> Any:
+    """NaN and infinity have no place in JSON."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value

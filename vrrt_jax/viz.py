@@ -1,0 +1,261 @@
+"""Figures and animations of plans."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+
+from vrrt_jax.core.edges import difference
+from vrrt_jax.core.kinematics import link_poses
+from vrrt_jax.core.obstacles import signed_distances
+from vrrt_jax.core.world import World, obstacle_list
+from vrrt_jax.planner import PlanResult
+from vrrt_jax.problems import Problem
+from vrrt_jax.robots import Robot
+from vrrt_jax.robots.sources import mesh_spec
+from vrrt_jax.splat.camera import project, shrunk
+from vrrt_jax.splat.goal import prepare_goal
+from vrrt_jax.splat.model import SelfModel
+from vrrt_jax.splat.raster import render
+from vrrt_jax.splat.types import Camera, SplatModel
+
+SKY = np.array([0.97, 0.98, 1.0])
+
+
+class ScenePainter:
+    """Pictures of robot and obstacles: MuJoCo's where it can, else splats over drawn obstacles."""
+
+    def __init__(self, robot: Robot, world: World, self_model: SelfModel, camera: Camera):
+        """Look for the robot's meshes and OpenGL; ``uses_meshes`` says what was found."""
+        self._camera, self._chain = camera, robot.chain
+        self._meshes = _mesh_renderer(robot, world)
+        self.uses_meshes = self._meshes is not None
+        if not self.uses_meshes:
+            splats = self_model.levels[-1].splats
+            self._background, self._depth = _draw_obstacles(world, camera)
+            self._robot = jax.jit(lambda q: _splat_layers(splats, robot, camera, q))
+
+    def paint(self, q: np.ndarray) -> np.ndarray:
+        """The scene at ``q``: (H, W, 3) uint8."""
+        if self._meshes is not None:
+            return self._meshes.scene(q, self._camera)
+        rgb, coverage, depth = (np.asarray(x) for x in self._robot(jnp.asarray(q, jnp.float32)))
+        alpha = np.where(depth < self._depth, coverage, 0.0)[..., None]
+        straight = rgb / np.maximum(coverage, 1e-3)[..., None]
+        mixed = (1 - alpha) * self._background + alpha * straight
+        return np.round(255 * np.clip(mixed, 0, 1)).astype(np.uint8)
+
+
+def _mesh_renderer(robot: Robot, world: World) -> Any:
+    from vrrt_jax.splat.mujoco_images import MeshRenderer
+
+    try:
+        spec = mesh_spec(robot)
+        if spec is None:
+            return None
+        renderer = MeshRenderer(spec, obstacle_list(world))
+        renderer.check()
+        return renderer
+    except (RuntimeError, OSError, ValueError):
+        return None  # no OpenGL, or no meshes to be had: splats are drawn instead
+
+
+def _splat_layers(splats: SplatModel, robot: Robot, camera: Camera, q: jax.Array):
+    """Colour over black, coverage and depth of the robot."""
+    poses = link_poses(robot.chain, q)
+    rgb, coverage = render(splats, poses, camera)
+    pose = poses[splats.link]
+    points = jnp.einsum("gij,gj->gi", pose[:, :3, :3], splats.mean) + pose[:, :3, 3]
+    _, depth = project(camera, points)
+    as_colour = SplatModel(
+        mean=splats.mean,
+        radius=splats.radius,
+        density=splats.density,
+        rgb=jnp.repeat(depth[:, None], 3, axis=1),
+        shade=jnp.zeros_like(splats.shade),
+        link=splats.link,
+        tau=splats.tau,
+    )
+    weighted, _ = render(as_colour, poses, camera)
+    return rgb, coverage, weighted[..., 0] / jnp.maximum(coverage, 1e-3)
+
+
+def _draw_obstacles(world: World, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Sphere-trace the obstacles: colour (H, W, 3) and depth (H, W), +inf where there is none."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    centre, focal = np.asarray(camera.centre), float(camera.focal)
+    in_cam = np.stack([(x - centre[0]) / focal, (y - centre[1]) / focal, np.ones_like(x)], -1)
+    rotation = np.asarray(camera.world_to_cam[:3, :3])
+    eye = jnp.asarray(-rotation.T @ np.asarray(camera.world_to_cam[:3, 3]))
+    rays = jnp.asarray((in_cam.reshape(-1, 3) @ rotation).T, jnp.float32)  # depth 1 along the axis
+    stretch = jnp.sqrt(jnp.sum(rays**2, axis=0))
+
+    @jax.jit
+    def trace(rays, stretch):
+        def nearest(depth):
+            return signed_distances(world.obstacles, eye[:, None] + depth * rays)
+
+        depth = jax.lax.fori_loop(
+            0, 60, lambda _, d: d + jnp.min(nearest(d), axis=1) / stretch, jnp.zeros_like(stretch)
+        )
+        point = eye[:, None] + depth * rays
+        surface = nearest(depth)
+        normal = jax.grad(lambda p: jnp.sum(jnp.min(signed_distances(world.obstacles, p), axis=1)))(
+            point
+        )
+        hit = (jnp.min(surface, axis=1) < 5e-3) & (depth < 30.0)
+        facing = jnp.abs(jnp.sum(normal * rays, axis=0)) / stretch
+        return depth, hit, jnp.argmin(surface, axis=1), facing
+
+    depth, hit, which, facing = (np.asarray(a) for a in trace(rays, stretch))
+    palette = np.array([list(c[:3]) if c else [0.5, 0.5, 0.5] for c in world.colours])
+    colour = palette[which] * (0.45 + 0.55 * facing[:, None])
+    colour = np.where(hit[:, None], colour, SKY)
+    shape = (camera.height, camera.width)
+    return colour.reshape(*shape, 3), np.where(hit, depth, np.inf).reshape(shape)
+
+
+def along(world: World, path: np.ndarray, num: int) -> np.ndarray:
+    """``num`` configurations at equal distances along a path (P, D)."""
+    path = np.asarray(path, np.float32)
+    step = np.asarray(difference(world, jnp.asarray(path[:-1]), jnp.asarray(path[1:])))
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(step, axis=1))])
+    at = np.linspace(0.0, length[-1], num)
+    index = np.clip(np.searchsorted(length, at, side="right") - 1, 0, max(len(step) - 1, 0))
+    if len(step) == 0 or length[-1] == 0:
+        return np.repeat(path[:1], num, axis=0)
+    share = (at - length[index]) / np.maximum(length[index + 1] - length[index], 1e-9)
+    return path[index] + share[:, None] * step[index]
+
+
+def save_animation(
+    problem: Problem, result: PlanResult, path: str | Path, *, height: int = 300, frames: int = 40
+) -> bool:
+    """Write a GIF: the motion in the scene, with the goal image beside it.
+
+    Args:
+        problem: the problem.
+        result: its plan.
+        path: of the ``.gif``.
+        height: of the picture [px].
+        frames: of the motion.
+
+    Returns:
+        Whether the robot is drawn with its true meshes.
+    """
+    camera = shrunk(problem.cameras[0], max(1, round(problem.cameras[0].height / height)))
+    painter = ScenePainter(problem.robot, problem.world, problem.self_model, camera)
+    goal = _picture(problem.goal_images[0], (camera.width, camera.height))
+    rule = np.full((camera.height, 4, 3), 255, np.uint8)
+    pictures = [
+        Image.fromarray(np.concatenate([painter.paint(q), rule, goal], axis=1))
+        for q in along(problem.world, result.path, frames)
+    ]
+    durations = [600, *[60] * (len(pictures) - 2), 1500]
+    pictures[0].save(
+        path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=True
+    )
+    return painter.uses_meshes
+
+
+def _picture(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A goal image over the sky's colour, resized: (H, W, 3) uint8."""
+    image = np.asarray(image, np.float32)
+    if image.shape[2] == 4:
+        image = image[..., :3] * image[..., 3:] + SKY * (1 - image[..., 3:])
+    pixels = np.round(255 * np.clip(image[..., :3], 0, 1)).astype(np.uint8)
+    return np.asarray(Image.fromarray(pixels).resize(size, Image.Resampling.BOX))
+
+
+def save_figure(problem: Problem, result: PlanResult, path: str | Path) -> None:
+    """Write a figure: start, goal image, rendered end and difference; loss; tree and path.
+
+    Raises:
+        ModuleNotFoundError: matplotlib is not installed.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(13, 7.2), constrained_layout=True)
+    grid = figure.add_gridspec(2, 4, height_ratios=(1, 1.05))
+    _draw_images(figure, grid, problem, result)
+    _draw_loss(figure.add_subplot(grid[1, :2]), result)
+    names = problem.robot.joint_names
+    spread = np.ptp(result.path, axis=0)
+    order = np.argsort(-spread, kind="stable")
+    planes = [(order[0], order[1]), (order[2 % len(order)], order[3 % len(order)])]
+    for column, (a, b) in enumerate(planes):
+        _draw_tree(figure.add_subplot(grid[1, 2 + column]), result, (int(a), int(b)), names)
+    verdict = result.status.name
+    if result.verification is not None and result.ok:
+        verdict += f", verified with {result.verification.geometry}"
+    figure.suptitle(
+        f"{problem.name}: {verdict}; {result.cost:.2f} rad in {len(result.path)} waypoints, "
+        f"search {result.timing['search_s']:.1f} s"
+    )
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _draw_images(figure, grid, problem: Problem, result: PlanResult) -> None:
+    camera = shrunk(problem.cameras[0], max(1, round(problem.cameras[0].height / 240)))
+    goal, _ = prepare_goal([problem.goal_images[0]], [problem.cameras[0]], camera.height)
+    painter = ScenePainter(problem.robot, problem.world, problem.self_model, camera)
+    splats = problem.self_model.level_for(camera.height).splats
+    end = link_poses(problem.robot.chain, jnp.asarray(result.q_goal, jnp.float32))
+    rgb, coverage = (np.asarray(a) for a in jax.jit(render)(splats, end, camera))
+    goal_rgb, goal_coverage = np.asarray(goal.rgb[0]), np.asarray(goal.coverage[0])
+    apart = np.abs(rgb - goal_rgb).mean(-1) + np.abs(coverage - goal_coverage)
+    panels = (
+        ("start", painter.paint(result.path[0])),
+        ("goal image", goal_rgb + SKY * (1 - goal_coverage[..., None])),
+        ("end, as the self-model sees it", rgb + SKY * (1 - coverage[..., None])),
+        ("difference", apart),
+    )
+    for column, (title, picture) in enumerate(panels):
+        axes = figure.add_subplot(grid[0, column])
+        if picture.ndim == 2:
+            axes.imshow(picture, cmap="magma", vmin=0, vmax=1)
+        else:
+            axes.imshow(np.clip(picture, 0, 1) if picture.dtype != np.uint8 else picture)
+        axes.set_title(title, fontsize=10)
+        axes.set_axis_off()
+
+
+def _draw_loss(axes, result: PlanResult) -> None:
+    history = result.history
+    axes.semilogy(history[:, 0], history[:, 2], color="tab:blue", label="best loss in the tree")
+    axes.axhline(result.goal_loss, color="tab:green", ls="--", lw=1, label="counts as matched")
+    axes.set_xlabel("iteration (32 expansions each)")
+    axes.set_ylabel("image loss")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+
+
+def _draw_tree(axes, result: PlanResult, joints: tuple[int, int], names: Sequence[str]) -> None:
+    from matplotlib.collections import LineCollection
+
+    size = int(result.tree.size)
+    q = np.asarray(result.tree.q)[:size][:, joints]
+    parent = np.asarray(result.tree.parent)[:size]
+    score = np.log10(np.asarray(result.tree.score)[:size] + 1e-9)
+    child = np.flatnonzero(parent >= 0)
+    edges = np.stack([q[parent[child]], q[child]], axis=1)
+    lines = LineCollection(edges.tolist(), cmap="viridis_r", linewidths=0.6, alpha=0.7)
+    lines.set_array(score[child])
+    axes.add_collection(lines)
+    path = result.path[:, joints]
+    axes.plot(path[:, 0], path[:, 1], "-", color="tab:red", lw=1.8, label="path")
+    axes.plot(*path[0], "o", color="tab:red", ms=5)
+    axes.plot(*path[-1], "*", color="tab:red", ms=11)
+    axes.set_xlabel(f"{names[joints[0]]} [rad]")
+    axes.set_ylabel(f"{names[joints[1]]} [rad]")
+    axes.autoscale()
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
