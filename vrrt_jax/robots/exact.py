@@ -86,16 +86,27 @@ def exact_model(
     """
     if geometry not in _GEOMETRIES:
         raise ValueError(f"geometry is '{geometry}'; expected one of: {', '.join(_GEOMETRIES)}")
+    names = [obstacle.name for obstacle in obstacles]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(
+            f"obstacle names used more than once: {', '.join(twice)}; expected distinct names"
+        )
     return _build(robot, tuple(_hashable(obstacle) for obstacle in obstacles), geometry)
 
 
 def _hashable(obstacle: Obstacle) -> Obstacle:
-    fields = {
-        name: tuple(float(value) for value in getattr(obstacle, name))
-        for name in ("position", "quaternion", "size")
-    }
-    # colours do not matter here: equal obstacles share a model
-    return Obstacle(name=obstacle.name, kind=obstacle.kind, **fields)
+    """The obstacle with tuples of floats, whatever it was made of, and without its colour."""
+    x, y, z = (float(value) for value in obstacle.position)
+    qw, qx, qy, qz = (float(value) for value in obstacle.quaternion)
+    a, b, c = (float(value) for value in obstacle.size)
+    return Obstacle(
+        name=obstacle.name,
+        kind=obstacle.kind,
+        position=(x, y, z),
+        quaternion=(qw, qx, qy, qz),
+        size=(a, b, c),
+    )
 
 
 @functools.lru_cache(maxsize=8)
@@ -123,7 +134,7 @@ def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> Exac
     except ValueError as error:
         reason = "; ".join(str(error).split("\n"))
         raise ValueError(
-            f"the obstacles do not compile: {reason}; expected distinct names and sizes as in MJCF"
+            f"the obstacles do not compile: {reason}; expected sizes as in MJCF, positive"
         ) from None
     is_obstacle = model.geom_bodyid >= num_bodies
     sees_obstacles = (model.geom_contype != 0) | (model.geom_conaffinity != 0)

@@ -7,9 +7,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-_JOINT_KINDS = {
-    mujoco.mjtJoint.mjJNT_FREE: "free",
-    mujoco.mjtJoint.mjJNT_BALL: "ball",
+_UNPLANNED = {
+    int(mujoco.mjtJoint.mjJNT_FREE): "free",
+    int(mujoco.mjtJoint.mjJNT_BALL): "ball",
 }
 
 
@@ -107,11 +107,11 @@ def check_joints(model: mujoco.MjModel) -> None:
             "the robot has no joint: nothing to plan; expected at least one hinge or slide joint"
         )
     for joint in range(model.njnt):
-        name, kind = model.joint(joint).name, model.jnt_type[joint]
-        if kind in _JOINT_KINDS:
+        name, kind = model.joint(joint).name, int(model.jnt_type[joint])
+        if kind in _UNPLANNED:
             body = model.body(model.jnt_bodyid[joint]).name
             raise ValueError(
-                f"joint '{name}' of body '{body}' is a {_JOINT_KINDS[kind]} joint; expected hinge "
+                f"joint '{name}' of body '{body}' is a {_UNPLANNED[kind]} joint; expected hinge "
                 "and slide joints on a fixed base: delete it, or replace it by hinges and slides"
             )
         if kind == mujoco.mjtJoint.mjJNT_SLIDE and not model.jnt_limited[joint]:
@@ -119,6 +119,13 @@ def check_joints(model: mujoco.MjModel) -> None:
                 f"slide joint '{name}' has no range; expected range=\"lower upper\" [m]: add it, "
                 f"or fix the joint with freeze={{'{name}': 0.0}}"
             )
+
+
+def joint_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper limits (D,) [rad] or [m]; -pi and pi for an unlimited hinge."""
+    limited = model.jnt_limited.astype(bool)
+    lower = np.where(limited, model.jnt_range[:, 0], -np.pi)
+    return lower, np.where(limited, model.jnt_range[:, 1], np.pi)
 
 
 def home_positions(model: mujoco.MjModel) -> dict[str, float]:

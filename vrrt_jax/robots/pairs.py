@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 
 from vrrt_jax.robots import text
+from vrrt_jax.robots.mjcf import joint_ranges
 
 _SAMPLES = 500
 _ALWAYS = 0.98  # a pair of bodies that touches more often than this is allowed to
@@ -31,9 +32,9 @@ def checked_pairs(model: mujoco.MjModel) -> np.ndarray:
     return np.stack([first[keep], second[keep]], -1).astype(np.int32)
 
 
-def _signature(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _signature(first: np.ndarray | int, second: np.ndarray | int) -> np.ndarray:
     """MuJoCo's number of a pair of bodies."""
-    return (np.minimum(first, second).astype(np.int64) << 16) + np.maximum(first, second)
+    return (np.int64(np.minimum(first, second)) << 16) + np.maximum(first, second)
 
 
 def excluded(model: mujoco.MjModel) -> list[tuple[str, str]]:
@@ -53,9 +54,7 @@ def always_touching(model: mujoco.MjModel) -> list[tuple[str, str]]:
         model: compiled from :func:`vrrt_jax.robots.text.collision_mjcf`.
     """
     rng = np.random.default_rng(0)
-    limited = model.jnt_limited.astype(bool)
-    lower = np.where(limited, model.jnt_range[:, 0], -np.pi)
-    upper = np.where(limited, model.jnt_range[:, 1], np.pi)
+    lower, upper = joint_ranges(model)
     data = mujoco.MjData(model)
     count: dict[tuple[int, int], int] = {}
     for sample in range(_SAMPLES + 1):
@@ -69,7 +68,7 @@ def always_touching(model: mujoco.MjModel) -> list[tuple[str, str]]:
     return [
         (model.body(first).name, model.body(second).name)
         for (first, second), times in sorted(count.items())
-        if times > _ALWAYS * _SAMPLES
+        if times > _ALWAYS * _SAMPLES and _signature(first, second) not in model.exclude_signature
     ]
 
 

@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 from scipy.spatial import ConvexHull
 
-_ROUND = 48  # sides of the prism around a cylinder; the prism is at most 0.2 % wider
+STEP = 1e-4  # [m] centres and radii of fitted spheres are multiples of this
+_ROUND = 32  # sides of the prism around a cylinder; the prism is at most 0.5 % wider
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -130,3 +131,73 @@ def surface_samples(pieces: list[Piece], spacing: float, rng: np.random.Generato
 def union_depth(pieces: list[Piece], points: np.ndarray) -> np.ndarray:
     """Depth (n,) of points (n, 3) below the surface of the deepest piece [m]; negative outside."""
     return np.max([piece.depth(points) for piece in pieces], axis=0)
+
+
+def contain_surface(
+    pieces: list[Piece], centres: np.ndarray, radii: np.ndarray, *, leaf: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Round spheres to steps of ``STEP`` and grow them until they provably contain a surface.
+
+    A triangle whose corners lie in one sphere lies in it as a whole. Triangles are split until
+    that is so, or until they are tiny; then the nearest sphere grows to take them in.
+
+    Args:
+        pieces: of one body.
+        centres: (n, 3) [m].
+        radii: (n,) [m].
+        leaf: size below which triangles are not split any further [m]; where two spheres meet,
+            they grow by up to half of it.
+
+    Returns:
+        Centres (n, 3) and radii (n,) [m].
+    """
+    centres = np.round(centres / STEP) * STEP
+    for piece in pieces:
+        triangles = piece.vertices[piece.triangles]
+        others = [other for other in pieces if other is not piece]
+        while len(triangles):
+            for other in others:  # what lies inside another piece is not surface
+                depth = other.depth(triangles.reshape(-1, 3)).reshape(-1, 3)
+                triangles = triangles[depth.min(1) < 0]
+            corner_distance = np.linalg.norm(triangles[:, :, None] - centres, axis=-1)
+            if not others:  # all corners are surface: gaps close here, before they are split
+                radii = grow(corner_distance.reshape(-1, len(radii)), radii)
+            distance = corner_distance.max(1)
+            is_bare = (distance > radii).all(1)
+            triangles, distance = triangles[is_bare], distance[is_bare]
+            edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=-1)
+            is_leaf = edges.max(1, initial=0) < leaf
+            radii = grow(distance[is_leaf], radii)
+            triangles = _split(triangles[~is_leaf])
+    return centres, np.ceil(radii / STEP - 1e-9) * STEP
+
+
+def grow(distance: np.ndarray, radii: np.ndarray) -> np.ndarray:
+    """Enlarge radii, each time as little as possible, until every point is in a sphere.
+
+    Args:
+        distance: (p, n) from points to centres [m].
+        radii: (n,) [m].
+
+    Returns:
+        (n,) radii [m].
+    """
+    radii = radii.copy()
+    while len(distance):
+        gap = distance - radii
+        nearest = gap.min(1)
+        worst = nearest.argmax()
+        if nearest[worst] <= 0:
+            break
+        sphere = gap[worst].argmin()
+        radii[sphere] = distance[worst, sphere]
+        distance = distance[nearest > 0]
+    return radii
+
+
+def _split(triangles: np.ndarray) -> np.ndarray:
+    """Four triangles (4 n, 3, 3) for each of (n, 3, 3)."""
+    a, b, c = (triangles[:, k] for k in range(3))
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    corners = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+    return np.concatenate([np.stack(corner, axis=1) for corner in corners])

@@ -37,7 +37,7 @@ class Robot:
     thin_bodies: tuple[str, ...]  # body of each sphere of ``thin``, for messages
     pairs: np.ndarray  # (P, 2) i32 indices into ``thin``: which are checked against each other
     allowed: tuple[tuple[str, str], ...]  # pairs of bodies that are never checked
-    frozen: Mapping[str, float]  # joints of the file that are fixed, and where [rad] or [m]
+    frozen: Mapping[str, float]  # joints of the true geometry that are fixed [rad] or [m]
     xml: str  # the collision model as MJCF; compiles by itself, without any mesh
     mesh_source: str | None  # name or file of the true geometry, see ``sources.mesh_spec``
 
@@ -63,33 +63,35 @@ def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None =
             ``freeze`` names a joint that does not exist.
     """
     path = robot_path(name_or_path)
-    model, home, frozen = _read(path, freeze)
-    is_packaged = str(name_or_path) in robot_names()
-    name = str(name_or_path) if is_packaged else path.stem
+    spec = mjcf.read_spec(path)
+    model, home, frozen = _reduce(spec, path, freeze)
     found = spheres.spheres_of(model)
     allowed = pairs.excluded(model)
-    spheres_text = functools.partial(
-        text.collision_mjcf, model, name=name, cover=found.cover, thin=found.thin, home=home
+    mesh_source = str(path.resolve())
+    if found.has_kinds:  # then they stand for geometry of another file, which this file names
+        mesh_source, fixed_before = text.source_of(spec)
+        frozen = fixed_before | frozen
+    fields = {
+        "name": str(name_or_path) if str(name_or_path) in robot_names() else path.stem,
+        "mesh_source": mesh_source,
+        "frozen": frozen,
+    }
+    write = functools.partial(
+        text.collision_mjcf, model, cover=found.cover, thin=found.thin, home=home, **fields
     )
     if not found.has_kinds:
-        draft = mujoco.MjModel.from_xml_string(spheres_text(allowed=allowed))
+        draft = mujoco.MjModel.from_xml_string(write(allowed=allowed))
         allowed += pairs.always_touching(draft)
-    xml = spheres_text(allowed=allowed)
+    xml = write(allowed=allowed)
     return _robot(
-        model=mujoco.MjModel.from_xml_string(xml),
-        name=name,
-        allowed=allowed,
-        frozen=frozen,
-        xml=xml,
-        mesh_source=name if is_packaged else str(path.resolve()),
+        model=mujoco.MjModel.from_xml_string(xml), allowed=tuple(allowed), xml=xml, **fields
     )
 
 
-def _read(
-    path: Path, freeze: Mapping[str, float] | None
+def _reduce(
+    spec: mujoco.MjSpec, path: Path, freeze: Mapping[str, float] | None
 ) -> tuple[mujoco.MjModel, np.ndarray, dict[str, float]]:
     """The model with planned joints only, its home (D,), and the joints that were fixed."""
-    spec = mjcf.read_spec(path)
     mjcf.strip_spec(spec, visuals=False)
     model = mjcf.compile_spec(spec, path)
     home = mjcf.home_positions(model)
@@ -103,7 +105,7 @@ def _read(
 def _robot(*, model: mujoco.MjModel, **fields) -> Robot:
     """Assemble a robot from its compiled collision model."""
     chain, body_link, body_in_link = chain_from_model(model)
-    limited = model.jnt_limited.astype(bool)
+    lower, upper = mjcf.joint_ranges(model)
     labels = {}
     for label, group in (("cover", text.COVER), ("thin", text.THIN)):
         geoms = np.flatnonzero(model.geom_group == int(group["group"]))
@@ -121,9 +123,9 @@ def _robot(*, model: mujoco.MjModel, **fields) -> Robot:
         chain=chain,
         joint_names=tuple(model.joint(j).name for j in range(model.njnt)),
         link_names=tuple(model.body(body).name for body in link_bodies),
-        lower=np.where(limited, model.jnt_range[:, 0], -np.pi),
-        upper=np.where(limited, model.jnt_range[:, 1], np.pi),
-        wraps=~limited,
+        lower=lower,
+        upper=upper,
+        wraps=model.jnt_limited == 0,
         home=model.key_qpos[0].copy(),
         pairs=pairs.checked_pairs(model),
         **labels,

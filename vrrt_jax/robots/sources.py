@@ -1,11 +1,13 @@
 """Where the true geometry of a robot is: needed to render it, to fit spheres and to verify."""
 
 import dataclasses
+import importlib
 import importlib.util
 import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -55,7 +57,8 @@ def mesh_spec(robot: "Robot", *, visuals: bool = True) -> mujoco.MjSpec | None:
     spec = mjcf.read_spec(path)
     mjcf.strip_spec(spec, visuals=visuals)
     source = _SOURCES.get(str(robot.mesh_source))
-    mjcf.freeze_joints(spec, source.freeze if source else robot.frozen)
+    fixed = source.freeze if source else {}
+    mjcf.freeze_joints(spec, {**fixed, **robot.frozen})
     return spec
 
 
@@ -97,13 +100,18 @@ def _in_root(source: _Source) -> Path | None:
     return path
 
 
-def _cached(source: _Source) -> Path | None:
+def _menagerie() -> ModuleType | None:
+    """The package ``mujoco-menagerie`` if it is installed."""
     if importlib.util.find_spec("mujoco_menagerie") is None:
         return None
-    import mujoco_menagerie
+    return importlib.import_module("mujoco_menagerie")
 
-    entry = mujoco_menagerie.get(source.folder)
-    cache = mujoco_menagerie.Cache()
+
+def _cached(source: _Source) -> Path | None:
+    menagerie = _menagerie()
+    if menagerie is None:
+        return None
+    entry, cache = menagerie.get(source.folder), menagerie.Cache()
     return cache.model_path(entry) / source.file if cache.is_cached(entry) else None
 
 
@@ -118,12 +126,11 @@ def _in_genesis(source: _Source) -> Path | None:
 
 def _downloaded(source: _Source) -> Path | None:
     # last, because it waits for minutes where the network is closed
-    if importlib.util.find_spec("mujoco_menagerie") is None:
+    menagerie = _menagerie()
+    if menagerie is None:
         return None
-    import mujoco_menagerie
-
     try:
-        return mujoco_menagerie.get(source.folder).path() / source.file
-    except mujoco_menagerie.MenagerieError as error:
+        return menagerie.get(source.folder).path() / source.file
+    except menagerie.MenagerieError as error:
         warnings.warn(f"the meshes of {source.folder} were not found: {error}", stacklevel=4)
         return None

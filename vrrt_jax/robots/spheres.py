@@ -6,9 +6,17 @@ import mujoco
 import numpy as np
 
 from vrrt_jax.robots import text
-from vrrt_jax.robots.pieces import Piece, collision_pieces, surface_samples, union_depth
+from vrrt_jax.robots.pieces import (
+    Piece,
+    collision_pieces,
+    contain_surface,
+    surface_samples,
+    union_depth,
+)
 
 _SPACING = 0.004  # [m] between surface samples
+_NUM_SURFACE, _NUM_CENTRES = 2000, 600
+_LEAF = 2e-3  # [m]
 _BULGE = 0.03  # [m] how far spheres fitted on loading stick out
 
 
@@ -88,46 +96,41 @@ def _fitted(model: mujoco.MjModel) -> RobotSpheres:
 def cover_body(
     pieces: list[Piece], bulge: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Greedy medial spheres that cover the surface of a body.
+    """Greedy medial spheres that contain the surface of a body.
 
     Args:
         pieces: convex pieces of the body.
-        bulge: how far a sphere may stick out of the piece that it lies in [m].
+        bulge: how far a sphere may stick out of the piece that it lies in [m], give or take 2 mm.
         rng: source of randomness.
 
     Returns:
         Centres (n, 3) and radii (n,) [m].
     """
     surface = surface_samples(pieces, _SPACING, rng)
-    centres = _inner_points(pieces, surface, rng)
+    if len(surface) > _NUM_SURFACE:
+        surface = surface[rng.choice(len(surface), _NUM_SURFACE, replace=False)]
+    centres = np.vstack([_inner_points(piece, rng) for piece in pieces])
     radii = union_depth(pieces, centres) + bulge
     covers = np.linalg.norm(surface[:, None] - centres, axis=-1) <= radii
-    left = np.ones(len(surface), bool)
     chosen = []
-    while left.any():
-        gain = covers[left].sum(0)
-        best = int(np.argmax(gain))
-        if gain[best] == 0:
+    while len(covers):
+        best = int(np.argmax(covers.sum(0)))
+        if not covers[:, best].any():
             break
         chosen.append(best)
-        left &= ~covers[:, best]
-    return centres[chosen], radii[chosen]
+        covers = covers[~covers[:, best]]
+    return contain_surface(pieces, centres[chosen], radii[chosen], leaf=_LEAF)
 
 
-def _inner_points(pieces: list[Piece], surface: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Points (n, 3) inside the body where spheres may be centred: random ones, pushed inwards."""
-    found = []
-    for piece in pieces:
-        corners = piece.vertices[np.unique(piece.triangles)]
-        points = rng.dirichlet(np.full(len(corners), 0.3), 600) @ corners
-        points = np.vstack([points, surface[rng.choice(len(surface), 300)]])
-        points = points[piece.depth(points) > -1e-6]
-        step = 0.02
-        for _ in range(40):  # uphill in depth: towards the medial axis
-            moved = points + rng.normal(size=points.shape) * step
-            better = piece.depth(moved) > piece.depth(points)
-            found.append(points[rng.random(len(points)) < 0.05])
-            points = np.where(better[:, None], moved, points)
-            step *= 0.93
-        found.append(points)
-    return np.vstack(found)
+def _inner_points(piece: Piece, rng: np.random.Generator) -> np.ndarray:
+    """Points (n, 3) where spheres may be centred, most of them far from the surface."""
+    corners = piece.vertices[np.unique(piece.triangles)]
+    points = rng.dirichlet(np.full(len(corners), 0.3), _NUM_CENTRES) @ corners
+    spread = np.ptp(corners, axis=0).max() / 10
+    for _ in range(30):  # uphill in depth, towards the medial axis; some stay on the way
+        moved = points + rng.normal(size=points.shape) * spread
+        better = piece.depth(moved) > piece.depth(points)
+        better &= rng.random(len(points)) > 0.1
+        points = np.where(better[:, None], moved, points)
+        spread *= 0.9
+    return points

@@ -2,6 +2,7 @@
 
 import dataclasses
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -11,6 +12,8 @@ import numpy as np
 # thin, and nothing else.
 COVER = {"group": "3", "contype": "0", "conaffinity": "1"}
 THIN = {"group": "4", "contype": "2", "conaffinity": "2"}
+_SOURCE = "mesh_source"
+_FROZEN = "frozen: "
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,6 +33,8 @@ def collision_mjcf(
     thin: BodySpheres,
     allowed: list[tuple[str, str]],
     home: np.ndarray,
+    mesh_source: str | None,
+    frozen: Mapping[str, float],
     comment: str = "",
 ) -> str:
     """The text of a model that C MuJoCo compiles by itself.
@@ -41,6 +46,8 @@ def collision_mjcf(
         thin: spheres checked against each other.
         allowed: pairs of bodies that are not checked against each other.
         home: (D,) joint positions of the keyframe [rad] or [m].
+        mesh_source: where the true geometry is found, kept for :func:`source_of`.
+        frozen: joints of the true geometry that are fixed [rad] or [m], kept likewise.
         comment: written at the top.
     """
     root = ET.Element("mujoco", model=name)
@@ -62,12 +69,28 @@ def collision_mjcf(
             for k in np.flatnonzero(spheres.body == body):
                 where = {"pos": _numbers(spheres.centre[k]), "size": _numbers(spheres.radius[k])}
                 ET.SubElement(elements[body], "geom", {"class": label} | where)
+    custom = ET.SubElement(root, "custom")
+    if mesh_source is not None:
+        ET.SubElement(custom, "text", name=_SOURCE, data=mesh_source)
+    for joint, position in frozen.items():
+        ET.SubElement(custom, "numeric", name=_FROZEN + joint, data=_numbers(position))
     contact = ET.SubElement(root, "contact")
     for first, second in allowed:
         ET.SubElement(contact, "exclude", body1=first, body2=second)
     ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="home", qpos=_numbers(home))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def source_of(spec: mujoco.MjSpec) -> tuple[str | None, dict[str, float]]:
+    """The ``mesh_source`` and ``frozen`` that :func:`collision_mjcf` kept, else None and {}."""
+    sources = [element.data for element in spec.texts if element.name == _SOURCE]
+    frozen = {
+        element.name.removeprefix(_FROZEN): float(element.data[0])
+        for element in spec.numerics
+        if element.name.startswith(_FROZEN)
+    }
+    return (sources[0] if sources else None), frozen
 
 
 def _add_body(parent: ET.Element, model: mujoco.MjModel, body: int) -> ET.Element:

@@ -1,0 +1,189 @@
+"""The exact check sees what it must, and says what touches what."""
+
+import dataclasses
+import time
+
+import numpy as np
+import pytest
+
+from vrrt_jax.core.types import Obstacle
+from vrrt_jax.core.verify import contacts, verify_path
+from vrrt_jax.robots import load_robot, sources
+
+GEOMETRIES = ("meshes", "spheres")
+
+PENDULUM = """
+<mujoco>
+  <worldbody>
+    <body name="arm" pos="0 0 1">
+      <joint name="swing" axis="0 0 1" limited="false"/>
+      <geom type="box" size="0.2 0.02 0.02" pos="0.25 0 0"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture(params=GEOMETRIES)
+def geometry(request, panda):
+    if request.param == "meshes" and sources.mesh_file(panda.mesh_source) is None:
+        pytest.skip("the Panda's meshes are not installed (mujoco-menagerie or genesis-world)")
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def pendulum(tmp_path_factory):
+    path = tmp_path_factory.mktemp("robots") / "pendulum.xml"
+    path.write_text(PENDULUM)
+    return load_robot(path)
+
+
+def swing(panda, start, end):
+    """Two way-points that differ in joint 1 only."""
+    path = np.tile(panda.home, (2, 1))
+    path[:, 0] = start, end
+    return path
+
+
+FLOOR = Obstacle(name="floor", kind="plane", position=(0, 0, 0))
+FAR = Obstacle(name="far", kind="cylinder", position=(-0.7, 0, 0.5), size=(0.05, 0.2, 0))
+POST = Obstacle(name="post", kind="box", position=(0.55, 0, 0.5), size=(0.05, 0.03, 0.4))
+
+
+def test_free_path_passes(panda, geometry):
+    result = verify_path(panda, [FLOOR, FAR], swing(panda, -1, 1), geometry=geometry)
+    assert result.ok and result.contact is None
+    assert result.geometry == geometry
+    assert result.checked == 401
+    assert 0.05 < result.clearance < 0.6
+
+
+def test_path_through_a_box_is_caught_and_named(panda, geometry):
+    result = verify_path(panda, [FLOOR, POST], swing(panda, -1, 1), geometry=geometry)
+    assert not result.ok
+    assert result.clearance <= 0
+    words = result.contact.split()
+    assert words[0] in {"link5", "link6", "link7", "hand", "left_finger", "right_finger"}
+    assert words[1:4] == ["touches", "post", "at"]
+    assert 20 < int(words[4]) < 50
+
+
+def test_thin_obstacle_between_way_points_is_caught(panda, geometry):
+    sheet = dataclasses.replace(POST, name="sheet", size=(0.3, 0.001, 0.4))
+    free_ends = swing(panda, -1, 1)
+    for q in free_ends:
+        assert contacts(panda, [sheet], q, geometry=geometry) == []
+    result = verify_path(panda, [sheet], free_ends, geometry=geometry)
+    assert not result.ok and "touches sheet" in result.contact
+
+
+def test_self_collision_is_caught(panda, geometry):
+    folded = panda.home.copy()
+    folded[[1, 3, 5]] = -1.5, -3.0, 0.5
+    (first, *_) = contacts(panda, [], folded, geometry=geometry)
+    assert "touches" in first
+    result = verify_path(panda, [], np.stack([panda.home, folded]), geometry=geometry)
+    assert not result.ok and "touches" in result.contact
+    assert np.isnan(result.clearance)
+
+
+def test_limits_are_caught(panda, geometry):
+    path = swing(panda, 0, 2.8973 * 1.25)
+    result = verify_path(panda, [], path, geometry=geometry)
+    assert not result.ok
+    assert result.contact.startswith("joint1 = 2.9") and result.contact.endswith(
+        "is outside [-2.8973, 2.8973] at 80 % of the path"
+    )
+    on_the_limit = swing(panda, 0, np.float32(2.8973))
+    assert verify_path(panda, [], on_the_limit, geometry=geometry).ok
+
+
+def test_base_may_stand_on_the_floor_but_links_may_not_touch_it(panda, geometry):
+    assert contacts(panda, [FLOOR], panda.home, geometry=geometry) == []
+    low = panda.home.copy()
+    low[1], low[3] = 1.7, -0.5
+    found = contacts(panda, [FLOOR], low, geometry=geometry)
+    assert found and all(line.endswith("touches floor") for line in found)
+
+
+def test_single_way_point_is_checked(panda, geometry):
+    result = verify_path(panda, [FLOOR], panda.home[None], geometry=geometry)
+    assert result.ok and result.checked == 1
+
+
+def test_meshes_and_spheres_agree_on_clearance(panda):
+    if sources.mesh_file(panda.mesh_source) is None:
+        pytest.skip("the Panda's meshes are not installed (mujoco-menagerie or genesis-world)")
+    path = swing(panda, -1, 1)
+    exact, covered = (
+        verify_path(panda, [FLOOR, FAR], path, geometry=geometry).clearance
+        for geometry in GEOMETRIES
+    )
+    assert covered <= exact + 1e-4  # spheres contain the meshes
+    assert covered > exact - 0.05
+
+
+def test_auto_takes_spheres_without_meshes(panda, monkeypatch):
+    monkeypatch.setenv("MENAGERIE_ROOT", "")
+    monkeypatch.setattr(sources.importlib.util, "find_spec", lambda name: None)
+    # obstacles of their own, or the model of another test would be found in the cache
+    obstacle = dataclasses.replace(FAR, name="unseen")
+    assert verify_path(panda, [obstacle], panda.home[None]).geometry == "spheres"
+    with pytest.raises(ValueError, match="meshes of robot 'panda' are not on this machine"):
+        verify_path(panda, [obstacle], panda.home[None], geometry="meshes")
+
+
+def test_wrapping_joint_takes_the_short_way(pendulum):
+    behind = Obstacle(name="behind", kind="box", position=(-0.3, 0, 1), size=(0.05, 0.05, 0.05))
+    ahead = dataclasses.replace(behind, name="ahead", position=(0.3, 0, 1))
+    path = np.array([[3.0 - 0.7], [-3.0 + 0.7]])  # 1.7 rad through pi
+    assert "arm touches behind" in verify_path(pendulum, [behind], path).contact
+    free = verify_path(pendulum, [ahead], path)
+    assert free.ok and free.checked == int(np.ceil((2 * np.pi - 4.6) / 0.005)) + 1
+    assert verify_path(pendulum, [ahead], path + 2 * np.pi).ok
+
+
+def test_files_own_geometry_is_the_truth(pendulum):
+    """A box arm: the corner of its covering spheres touches where the box does not."""
+    close = Obstacle(name="close", kind="sphere", position=(0.25, 0.0, 1.03), size=(0.009, 0, 0))
+    assert contacts(pendulum, [close], np.zeros(1)) == []
+    assert contacts(pendulum, [close], np.zeros(1), geometry="spheres") == ["arm touches close"]
+
+
+def test_typical_path_is_verified_in_time(panda):
+    obstacles = [
+        dataclasses.replace(FAR, name=f"post {k}", position=(-0.7, 0.1 * k, 0.5)) for k in range(8)
+    ]
+    path = swing(panda, -1, 1)
+    verify_path(panda, obstacles, path)
+    started = time.perf_counter()
+    assert verify_path(panda, obstacles, path).ok
+    assert time.perf_counter() - started < 1.0  # 0.03 s on an idle machine
+
+
+@pytest.mark.parametrize(
+    ("path", "arguments", "message"),
+    [
+        (np.zeros((2, 6)), {}, r"shape \(2, 6\); expected \(way-points, 7\).*joint1, joint2"),
+        (np.zeros((0, 7)), {}, r"shape \(0, 7\)"),
+        (np.full((2, 7), np.nan), {}, "way-point 0 of the path is not finite"),
+        (np.zeros((2, 7)), {"step": 0.0}, "step is 0.0; expected a positive"),
+        (np.zeros((2, 7)), {"geometry": "mesh"}, "expected one of: auto, meshes, spheres"),
+    ],
+)
+def test_bad_arguments(panda, path, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        verify_path(panda, [], path, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("obstacles", "message"),
+    [
+        ([dataclasses.replace(POST, kind="cone")], "'post' is a 'cone'; expected one of: sphere"),
+        ([dataclasses.replace(POST, size=(0, 0, 0))], "do not compile.*size"),
+        ([POST, POST], "used more than once: post; expected distinct"),
+    ],
+)
+def test_bad_obstacles(panda, obstacles, message):
+    with pytest.raises(ValueError, match=message):
+        verify_path(panda, obstacles, panda.home[None], geometry="spheres")
