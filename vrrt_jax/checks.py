@@ -16,7 +16,7 @@ from vrrt_jax.splat.types import Camera, SplatModel
 
 _is_free = jax.jit(is_free)
 
-# name: (lowest, highest, is the highest allowed)
+# name: (lowest, highest)
 RANGES = {
     "alpha": (0.0, 1.0),
     "epsilon": (0.0, 1.0),
@@ -30,7 +30,14 @@ RANGES = {
     "time_limit_s": (0.0, np.inf),
     "max_iterations": (1, np.inf),
     "patience": (1, np.inf),
+    "settle": (0, np.inf),
+    "min_ratio": (0.0, 1.0),
     "shortcut_rounds": (0, np.inf),
+    "connect_iterations": (1, np.inf),
+    "probes": (0, 1 << 20),
+    "probes_kept": (1, np.inf),
+    "probe_radius": (0.0, np.inf),
+    "probe_px": (8, 4096),
     "lanes": (1, 4096),
     "image_px": (8, 4096),
 }
@@ -45,10 +52,11 @@ def check_config(config: Any) -> None:
     for name in ("kappa", "beta1", "beta2"):
         if not 0.0 <= getattr(config, name) < 1.0:
             raise ValueError(f"{name}={getattr(config, name)} is out of range; expected [0, 1)")
-    if config.capacity < config.lanes + 2:
+    roots = 2 + min(config.probes, config.probes_kept)
+    if config.capacity < config.lanes + roots:
         raise ValueError(
-            f"capacity={config.capacity} leaves no room for one iteration of {config.lanes} "
-            f"lanes; expected at least {config.lanes + 2}, for example 8192"
+            f"capacity={config.capacity} leaves no room for {roots - 1} roots and one iteration of "
+            f"{config.lanes} lanes; expected at least {config.lanes + roots}, for example 8192"
         )
 
 

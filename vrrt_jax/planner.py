@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -21,7 +21,7 @@ from vrrt_jax.robots.robot import Robot
 from vrrt_jax.splat.goal import prepare_goal
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera
-from vrrt_jax.visual import VisualPolicy
+from vrrt_jax.visual import Probing, VisualPolicy, plant
 
 STATUS_OF = {
     Stopped.CONVERGED: Status.NO_MATCH,
@@ -32,6 +32,10 @@ STATUS_OF = {
 }
 
 
+PLANTING = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
+HYPOTHESES = 3  # matched configurations that are tried before there is no path
+DISTINCT = 0.3  # [rad] distance at which they count as different
+SAME_LOSS = 1.05  # losses within this factor are the same match
 RRT_STAR_RADIUS = 1.9  # [rad] nodes of a sparse tree in seven dimensions lie that far apart
 
 
@@ -51,12 +55,19 @@ class PlannerConfig:
     beta2: float = 0.9
     anneal: float = 10.0  # Adam steps shrink below this many times the match bar; 0 = never
     match_scale: float = 1.0  # the goal loss, in units of the self-model's calibrated bar
+    probes: int = 1024  # renders around the start that seed the search (re-compiles)
+    probe_radius: float = 2.8  # how far from it [rad]
+    probes_kept: int = 63  # best of them that become roots beside the start (re-compiles)
+    probe_px: int = 32  # image height that they are rendered at (re-compiles)
     rewiring: bool = True  # RRT*
     rewire_radius: float = 0.3  # [rad]
     max_iterations: int = 400
-    patience: int | None = 100  # iterations without ``min_improvement`` that end the search
-    min_improvement: float = 1e-4
+    settle: int = 12  # once matched, iterations without improvement until the search ends
+    patience: int | None = 100  # iterations without improvement after which it gives up
+    min_improvement: float = 0.0  # an improvement is a loss this much smaller ...
+    min_ratio: float = 0.97  # ... and below this share of the one before
     time_limit_s: float = float("inf")  # of the search, compilation excluded [s]
+    connect_iterations: int = 200  # of RRT-Connect, to a match that the tree has not reached
     shortcut_rounds: int = 60
     verify_step: float = 0.005  # [rad]
     lanes: int = 32  # expansions an iteration (re-compiles)
@@ -65,8 +76,9 @@ class PlannerConfig:
 
     @classmethod
     def paper(cls, **changes: Any) -> "PlannerConfig":
-        """The published method (Visual-RRT, CVPR 2026): constant Adam steps, patience rule."""
-        return cls(**{"anneal": 0.0, **changes})
+        """The published method (Visual-RRT, CVPR 2026): one tree, constant Adam steps."""
+        paper = {"probes": 0, "anneal": 0.0, "settle": 0, "min_improvement": 1e-4, "min_ratio": 1.0}
+        return cls(**{**paper, **changes})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -138,8 +150,12 @@ def plan(
     config = config or PlannerConfig()
     checks.check_config(config)
     q_start = checks.check_start(robot, world, q_start)
-    policy, goal_loss = visual_policy(robot, self_model, camera, goal_image, q_start, config)
-    tree, compile_s = _timed(plant, world, policy, jnp.asarray(q_start), config.capacity)
+    policy, probing, goal_loss = visual_policy(
+        robot, self_model, camera, goal_image, q_start, config
+    )
+    seeds = (world, policy, probing, jnp.asarray(q_start), jax.random.fold_in(key, PLANTING))
+    _, compile_s = _timed(_plant, *seeds, config.capacity)
+    tree, plant_s = _timed(_plant, *seeds, config.capacity)
     found = search(
         world,
         policy,
@@ -149,7 +165,11 @@ def plan(
         time_limit_s=config.time_limit_s,
         on_progress=on_progress,
     )
-    found = dataclasses.replace(found, compile_s=found.compile_s + compile_s)
+    found = dataclasses.replace(
+        found,
+        compile_s=found.compile_s + max(compile_s - plant_s, 0.0),
+        search_s=found.search_s + plant_s,
+    )
     return _finish_visual(robot, world, found, goal_loss, q_start, key, config)
 
 
@@ -191,21 +211,22 @@ def plan_batch(
             f"got {len(goal_images)} goal images and {len(q_starts)} starts; expected as many, "
             "and at least one"
         )
-    starts, policies, goal_losses = [], [], []
+    starts, policies, goal_losses = [], [], []  # policies with their probing
     for i, (image, q_start) in enumerate(zip(goal_images, q_starts, strict=True)):
         try:
             starts.append(checks.check_start(robot, world, q_start))
-            policy, loss = visual_policy(robot, self_model, camera, image, starts[-1], config)
+            *policy, loss = visual_policy(robot, self_model, camera, image, starts[-1], config)
         except ValueError as error:
             raise ValueError(f"problem {i}: {error}") from None
         policies.append(policy)
         goal_losses.append(loss)
-    policies = _stack(policies)
+    policies, probings = _stack(policies)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(starts)))
     started = time.perf_counter()
-    plants = jax.vmap(plant, (None, 0, 0, None))
+    plants = jax.vmap(_plant, (None, 0, 0, 0, 0, None))
+    seeds = jax.vmap(jax.random.fold_in, (0, None))(keys, PLANTING)
     tree = jax.block_until_ready(
-        plants(world, policies, jnp.asarray(np.stack(starts)), config.capacity)
+        plants(world, policies, probings, jnp.asarray(np.stack(starts)), seeds, config.capacity)
     )
     compile_s = time.perf_counter() - started
     found = search(
@@ -286,14 +307,9 @@ def plan_to_configuration(
         time_limit_s=config.time_limit_s,
         on_progress=on_progress,
     )
-    if planner == "rrt-connect":
-        path = connection_path(found.tree)
-    else:
-        path = tree_path(found.tree)
+    path = connection_path(found.tree) if planner == "rrt-connect" else tree_path(found.tree)
     loss = float(jnp.min(found.tree.score))
-    if path is None:
-        path = q_start[None]
-    return _finish(robot, world, found, path, loss, max(stop_score, 1e-4), key, config)
+    return _finish(robot, world, found, path, loss, max(stop_score, 1e-4), key, config, q_start)
 
 
 def visual_policy(
@@ -303,8 +319,8 @@ def visual_policy(
     goal_image: Any,
     q_start: np.ndarray,
     config: PlannerConfig,
-) -> tuple[VisualPolicy, float]:
-    """The policy, and the loss at which the goal counts as matched."""
+) -> tuple[VisualPolicy, Probing, float]:
+    """The policy, where to look before the search, and the loss that counts as matched."""
     checks.check_self_model(robot, self_model)
     if isinstance(camera, Camera):
         camera, goal_image = [camera], [goal_image]
@@ -332,27 +348,33 @@ def visual_policy(
         rewiring=config.rewiring,
         lanes=config.lanes,
     )
-    return policy, goal_loss
+    coarse_goal, coarse_cameras = prepare_goal(goal_image, camera, config.probe_px)
+    coarse = dataclasses.replace(
+        policy,
+        splats=self_model.level_for(coarse_goal.coverage.shape[1]).splats,
+        cameras=coarse_cameras,
+        goal=coarse_goal,
+    )
+    probing = Probing(
+        policy=coarse,
+        radius=jnp.float32(config.probe_radius),
+        num=config.probes,
+        kept=min(config.probes, config.probes_kept),
+    )
+    return policy, probing, goal_loss
 
 
-def plant(world: World, policy: VisualPolicy, q_start: jax.Array, capacity: int) -> Tree:
-    """A visual tree of ``capacity`` slots with its root at ``q_start`` (D,)."""
-    score, payload = _root(world, policy, q_start)
-    roots = jax.tree.map(lambda leaf: leaf[None], (q_start, score, payload))
-    return trees.create(*roots, capacity)
-
-
-@jax.jit
-def _root(world: World, policy: VisualPolicy, q_start: jax.Array):
-    return policy.root(world, q_start)
+_plant = jax.jit(plant, static_argnums=5)
 
 
 def _visual_stop(config: PlannerConfig, goal_loss: float):
     return make_stop(
         goal_loss,
+        settle=config.settle,
         max_iterations=config.max_iterations,
         patience=config.patience,
         min_improvement=config.min_improvement,
+        min_ratio=config.min_ratio,
     )
 
 
@@ -365,27 +387,67 @@ def _finish_visual(
     key: jax.Array,
     config: PlannerConfig,
 ) -> PlanResult:
-    """Of the nodes that match, take the nearest to the start; if none does, the best."""
+    """Choose where to end, and connect it to the start if its tree is not the start's."""
     score, q = np.asarray(found.tree.score), np.asarray(found.tree.q)
-    matched = np.flatnonzero(score <= goal_loss)
-    best = int(np.argmin(score))
-    if len(matched):
-        best = int(matched[np.argmin(np.linalg.norm(q[matched] - q_start, axis=1))])
-    path = tree_path(found.tree, best)
-    return _finish(robot, world, found, path, float(score[best]), goal_loss, key, config)
+    for best in _hypotheses(score, q, q_start, goal_loss):
+        path = tree_path(found.tree, best)
+        if np.array_equal(path[0], q_start) or score[best] > goal_loss:
+            break
+        connection = _connect(world, q_start, q[best], key, config)
+        path = connection_path(connection.tree)
+        found = dataclasses.replace(
+            found,
+            compile_s=found.compile_s + connection.compile_s,
+            search_s=found.search_s + connection.search_s,
+        )
+        if path is not None:
+            break
+    else:
+        best, path = int(np.argmin(score)), None
+    return _finish(robot, world, found, path, float(score[best]), goal_loss, key, config, q_start)
+
+
+def _hypotheses(
+    score: np.ndarray, q: np.ndarray, q_start: np.ndarray, goal_loss: float
+) -> Iterator[int]:
+    """Nodes to end at: as good as the best, nearest to the start first; then other matches."""
+    open_nodes = np.flatnonzero(score <= max(goal_loss, score.min()))
+    for _ in range(HYPOTHESES):
+        if len(open_nodes) == 0:
+            return
+        # Nodes just under the bar would be nearer still, but only as they are not there yet.
+        equal = open_nodes[score[open_nodes] <= SAME_LOSS * score[open_nodes].min()]
+        best = int(equal[np.argmin(np.linalg.norm(q[equal] - q_start, axis=1))])
+        yield best
+        open_nodes = open_nodes[np.linalg.norm(q[open_nodes] - q[best], axis=1) > DISTINCT]
+
+
+def _connect(
+    world: World, q_start: np.ndarray, q_goal: np.ndarray, key: jax.Array, config: PlannerConfig
+) -> SearchResult:
+    policy = RRTConnect(lanes=config.lanes)
+    tree = policy.forest(jnp.asarray(q_start), jnp.asarray(q_goal), config.capacity)
+    stop = make_stop(0.0, max_iterations=config.connect_iterations)
+    return search(world, policy, tree, key=key, stop=stop, time_limit_s=config.time_limit_s)
 
 
 def _finish(
     robot: Robot,
     world: World,
     found: SearchResult,
-    raw_path: np.ndarray,
+    raw_path: np.ndarray | None,
     loss: float,
     goal_loss: float,
     key: jax.Array,
     config: PlannerConfig,
+    q_start: np.ndarray,
 ) -> PlanResult:
-    """Shorten and verify; if the shortened path fails the exact check, fall back on the raw one."""
+    """Shorten and verify; if the shortened path fails the exact check, fall back on the raw one.
+
+    Without a path the result is the start alone.
+    """
+    has_path = raw_path is not None
+    raw_path = q_start[None] if raw_path is None else raw_path
     _, shortcut_compile_s = _timed(shortcut, world, raw_path, key=key, rounds=0)
     started = time.perf_counter()
     path = shortcut(world, raw_path, key=key, rounds=config.shortcut_rounds)
@@ -400,7 +462,9 @@ def _finish(
             path, verification = raw_path, raw
     verify_s = time.perf_counter() - started
 
-    if loss > goal_loss:
+    if not has_path:
+        status = Status.NO_PATH
+    elif loss > goal_loss:
         status = STATUS_OF.get(found.stopped, Status.NO_MATCH)
     else:
         status = Status.SOLVED if verification.ok else Status.NOT_VERIFIED

@@ -10,21 +10,14 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from vrrt_jax.core.edges import difference
+from vrrt_jax.core import tree as trees
+from vrrt_jax.core.edges import difference, normalise
 from vrrt_jax.core.rewire import rewire
 from vrrt_jax.core.rrt import sample_configurations
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
-from vrrt_jax.core.world import World
+from vrrt_jax.core.world import World, is_free
 from vrrt_jax.splat.loss import goal_loss
-
-try:
-    from vrrt_jax.splat.raster import map_lanes
-except ImportError:
-
-    def map_lanes(f, *a):
-        return jax.lax.map(lambda x: f(*x), a, batch_size=4)
-
-
+from vrrt_jax.splat.raster import map_lanes
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
 
 
@@ -65,13 +58,13 @@ class VisualPolicy:
         """Image loss () of a configuration (D,)."""
         return goal_loss(world.chain, self.splats, self.cameras, self.goal, q)
 
-    def root(self, world: World, q: jax.Array) -> tuple[jax.Array, VisualNode]:
-        """Loss and payload of a root."""
-        loss, grad = jax.value_and_grad(self.loss, argnums=1)(world, q)
+    def roots(self, world: World, q: jax.Array) -> tuple[jax.Array, VisualNode]:
+        """Losses (R,) and payloads of roots ``q`` (R, D)."""
+        loss, grad = map_lanes(jax.value_and_grad(lambda q: self.loss(world, q)), q)
         adam = optax.ScaleByAdamState(
-            count=jnp.int32(0), mu=jnp.zeros_like(q), nu=jnp.zeros_like(q)
+            count=jnp.zeros(len(q), jnp.int32), mu=jnp.zeros_like(q), nu=jnp.zeros_like(q)
         )
-        return loss, VisualNode(grad=grad, adam=adam, exploited=jnp.bool_(False))
+        return loss, VisualNode(grad=grad, adam=adam, exploited=jnp.zeros(len(q), bool))
 
     def propose(self, world: World, tree: Tree[VisualNode], key: jax.Array) -> Proposals:
         """Draw parents from the frontier, then step along the image gradient or at random.
@@ -161,3 +154,56 @@ class VisualPolicy:
         return rewire(
             world, tree, expansion, radius=self.rewire_radius, edge_steps=self.rewire_steps
         )
+
+
+@pytree
+class Probing:
+    """Where to look before the search: forward-only renders around the start, at low resolution."""
+
+    policy: VisualPolicy  # with the coarse goal; only its loss is used
+    radius: jax.Array  # () largest distance from the start [rad]
+    num: int = static()  # configurations rendered; none gives the plain tree of the paper
+    kept: int = static()  # best of them that become roots
+
+
+def plant(
+    world: World,
+    policy: VisualPolicy,
+    probing: Probing,
+    q_start: jax.Array,
+    key: jax.Array,
+    capacity: int,
+) -> Tree[VisualNode]:
+    """A forest before the search: the start, and the probes that look most like the goal.
+
+    A probe's root has the cost :data:`~vrrt_jax.core.tree.UNREACHED`, until rewiring finds a way to
+    it from the start's tree.
+
+    Args:
+        world: robot and obstacles.
+        policy: of the search.
+        probing: where to look.
+        q_start: (D,).
+        key: random key.
+        capacity: slots of the tree.
+    """
+    q = q_start[None]
+    if probing.num:
+        q = jnp.concatenate([q, _best_probes(world, probing, q_start, key)])
+    score, payload = policy.roots(world, q)
+    cost = jnp.full(len(q), trees.UNREACHED).at[0].set(0.0)
+    return trees.create(q, score, payload, capacity, cost)
+
+
+def _best_probes(world: World, probing: Probing, q_start: jax.Array, key: jax.Array) -> jax.Array:
+    """Configurations (kept, D) around the start that are free and render most like the goal."""
+    key_direction, key_distance = jax.random.split(key)
+    direction = jax.random.normal(key_direction, (probing.num, len(q_start)))
+    direction /= jnp.linalg.norm(direction, axis=1, keepdims=True)
+    distance = probing.radius * jax.random.uniform(key_distance, (probing.num, 1))
+    q = q_start + distance * direction
+    q = jnp.where(world.wraps, normalise(world, q), jnp.clip(q, world.lower, world.upper))
+    loss = map_lanes(lambda q: probing.policy.loss(world, q), q)
+    loss = jnp.where(jax.vmap(is_free, (None, 0))(world, q), loss, jnp.inf)
+    _, best = jax.lax.top_k(-loss, probing.kept)
+    return q[best]

@@ -14,6 +14,7 @@ from vrrt_jax.core.expand import expand
 from vrrt_jax.core.search import make_stop, search
 from vrrt_jax.core.types import Expansion
 from vrrt_jax.problems import Problem, load_problem, problem_names
+from vrrt_jax.visual import plant
 
 
 def run(repeats: int = 15, seeds: int = 3) -> dict:
@@ -28,7 +29,7 @@ def run(repeats: int = 15, seeds: int = 3) -> dict:
 def iteration_split(problem: Problem, repeats: int = 15) -> dict:
     """Times of the parts of one iteration on a grown tree, each jitted by itself [ms]."""
     config = planner.PlannerConfig()
-    policy, _ = planner.visual_policy(
+    policy, probing, _ = planner.visual_policy(
         problem.robot,
         problem.self_model,
         problem.cameras,
@@ -37,7 +38,8 @@ def iteration_split(problem: Problem, repeats: int = 15) -> dict:
         config,
     )
     world, key = problem.world, jax.random.key(0)
-    tree = planner.plant(world, policy, jnp.asarray(problem.q_start), config.capacity)
+    q_start = jnp.asarray(problem.q_start)
+    tree = jax.jit(plant, static_argnums=5)(world, policy, probing, q_start, key, config.capacity)
     found = search(
         world, policy, tree, key=key, stop=make_stop(-1.0, max_iterations=40), time_limit_s=60.0
     )

@@ -1,7 +1,9 @@
 """RRT*: choose the cheapest parent for new nodes, and let them adopt others.
 
 A batch is rewired at once, on the costs before it: a parent is adopted only if that makes a node
-strictly cheaper, and costs grow along every branch, so no two adoptions can close a cycle.
+strictly cheaper, and costs grow along every branch, so no two adoptions can close a cycle. In a
+forest
+this also joins trees: their roots, but for the first, may be adopted like any node.
 """
 
 import dataclasses
@@ -57,7 +59,8 @@ def rewire(
     cost = tree.cost.at[slot].set(cost_via, mode="drop")
 
     through = jnp.where(near, cost[new][:, None] + apart, jnp.inf)
-    gain = jnp.where(tree.parent >= 0, cost - through, -jnp.inf)
+    is_main_root = jnp.arange(tree.capacity) == 0
+    gain = jnp.where(is_main_root, -jnp.inf, cost - through)
     child, most = jnp.argmax(gain, axis=1), jnp.max(gain, axis=1)
     same_child = child[:, None] == child
     rival = (most[None] > most[:, None]) | (
@@ -74,13 +77,13 @@ def rewire(
 
 
 def with_costs(world: World, tree: Tree[Payload]) -> Tree[Payload]:
-    """Recompute every node's path length from the root, by pointer doubling."""
+    """Recompute every node's path length, by pointer doubling; roots keep the cost they have."""
     has_parent = tree.parent >= 0
     ancestor = jnp.where(has_parent, tree.parent, jnp.arange(tree.capacity))
-    cost = jnp.where(has_parent, distance(world, tree.q[ancestor], tree.q), 0.0)
+    length = jnp.where(has_parent, distance(world, tree.q[ancestor], tree.q), 0.0)
     for _ in range(max(tree.capacity - 1, 1).bit_length()):
-        cost, ancestor = cost + cost[ancestor], ancestor[ancestor]
-    return dataclasses.replace(tree, cost=cost)
+        length, ancestor = length + length[ancestor], ancestor[ancestor]
+    return dataclasses.replace(tree, cost=tree.cost[ancestor] + length)
 
 
 def _edge_is_free(world: World, q_from: jax.Array, q_to: jax.Array, steps: int) -> jax.Array:

@@ -37,9 +37,11 @@ class Stop:
     """When to stop, as traced numbers."""
 
     score: jax.Array  # () goal score
+    settle: jax.Array  # () i32 once there, go on until the best score has not improved for so long
     max_iterations: jax.Array  # () i32
-    patience: jax.Array  # () i32 iterations within which the best score must improve ...
-    min_improvement: jax.Array  # () ... by this much
+    patience: jax.Array  # () i32 give up after so many iterations without improvement
+    min_improvement: jax.Array  # () what counts as one: so much less ...
+    min_ratio: jax.Array  # () ... or below this multiple of the score before
 
 
 @pytree
@@ -66,15 +68,19 @@ def make_stop(
     score: float,
     *,
     max_iterations: int,
+    settle: int = 0,
     patience: int | None = None,
     min_improvement: float = 0.0,
+    min_ratio: float = 1.0,
 ) -> Stop:
     """A stopping rule; without ``patience`` the search never counts as converged."""
     return Stop(
         score=jnp.float32(score),
+        settle=jnp.int32(settle),
         max_iterations=jnp.int32(max_iterations),
         patience=jnp.int32(patience if patience is not None else np.iinfo(np.int32).max),
         min_improvement=jnp.float32(min_improvement),
+        min_ratio=jnp.float32(min_ratio),
     )
 
 
@@ -88,9 +94,10 @@ def initial_state(tree: Tree) -> SearchState:
 def why_stopped(state: SearchState, stop: Stop) -> jax.Array:
     """The :class:`Stopped` code () that holds, -1 while the search should go on."""
     tree = state.tree
+    idle = tree.iteration - state.reference_iteration
     reasons = (
-        (Stopped.REACHED, jnp.min(tree.score) <= stop.score),
-        (Stopped.CONVERGED, tree.iteration - state.reference_iteration >= stop.patience),
+        (Stopped.REACHED, (jnp.min(tree.score) <= stop.score) & (idle >= stop.settle)),
+        (Stopped.CONVERGED, idle >= stop.patience),
         (Stopped.ITERATIONS, tree.iteration >= stop.max_iterations),
         (Stopped.TREE_FULL, tree.size >= tree.capacity),
     )
@@ -117,7 +124,8 @@ def run_chunk(
     def iterate(state: SearchState) -> SearchState:
         tree = expand(world, policy, state.tree, key)
         best = jnp.min(tree.score)
-        improved = best < state.reference_score - stop.min_improvement
+        bar = state.reference_score * stop.min_ratio - stop.min_improvement
+        improved = best < bar
         return SearchState(
             tree=tree,
             reference_score=jnp.where(improved, best, state.reference_score),

@@ -14,14 +14,24 @@ from vrrt_jax.core.world import World
 Payload = TypeVar("Payload")
 
 
-def create(q: jax.Array, score: jax.Array, payload: Payload, capacity: int) -> Tree[Payload]:
-    """A tree (or a forest) of R roots.
+UNREACHED = 1e3  # [rad] cost of a root that is not known to be reachable from the first
+
+
+def create(
+    q: jax.Array,
+    score: jax.Array,
+    payload: Payload,
+    capacity: int,
+    cost: jax.Array | float = 0.0,
+) -> Tree[Payload]:
+    """A tree, or a forest of R roots.
 
     Args:
         q: (R, D) root configurations.
         score: (R,) their scores.
         payload: their payloads, leaves (R, ...).
         capacity: number of slots N, at least R.
+        cost: (R,) costs of the roots; :data:`UNREACHED` for those no path is known to.
     """
     roots = q.shape[0]
 
@@ -32,7 +42,7 @@ def create(q: jax.Array, score: jax.Array, payload: Payload, capacity: int) -> T
     return Tree(
         q=padded(q, 0),
         parent=jnp.full(capacity, -1, jnp.int32),
-        cost=jnp.zeros(capacity, q.dtype),
+        cost=padded(jnp.broadcast_to(jnp.asarray(cost, q.dtype), roots), 0),
         score=padded(score, jnp.inf),
         size=jnp.int32(roots),
         iteration=jnp.int32(0),
