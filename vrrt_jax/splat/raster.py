@@ -138,3 +138,8 @@ def _ratio_jvp(primals, tangents):
     inverse = 1.0 / (weight[..., None] + MIN_WEIGHT)
     ratio = colour * inverse
     return ratio, (colour_dot - ratio * weight_dot[..., None]) * inverse
+
+
+def map_lanes(f, *args: jax.Array):
+    """Map ``f`` over the leading axis of the arguments, a few at a time, so that caches hold."""
+    return jax.lax.map(lambda lane: f(*lane), args, batch_size=4)
