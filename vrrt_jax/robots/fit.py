@@ -3,11 +3,11 @@
 import functools
 from collections.abc import Callable
 
-import mujoco
 import numpy as np
 
 from vrrt_jax.robots import cover, text, thin
-from vrrt_jax.robots.pieces import STEP, collision_pieces, contain_surface
+from vrrt_jax.robots.pairs import allowed_pairs, sample_self_collisions
+from vrrt_jax.robots.pieces import collision_pieces, contain_surface
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.robots.sources import mesh_spec
 
@@ -61,30 +61,21 @@ def fit_spheres(
     proven = {
         body: contain_surface(pieces[body], *fitted[body], leaf=_LEAF) for body in sorted(fitted)
     }
-    found = thin.sample_self_collisions(model, _CONFIGURATIONS, rng)
-    allowed = thin.allowed_pairs(model, found)
+    found = sample_self_collisions(model, _CONFIGURATIONS, rng)
+    allowed = allowed_pairs(model, found)
     write = functools.partial(
         text.collision_mjcf,
         model,
         name=robot.name,
         cover=_collect({body: proven[body] for body in moving}),
-        allowed=[(model.body(a).name, model.body(b).name) for a, b in allowed],
         home=robot.home,
         mesh_source=robot.mesh_source,
         frozen=robot.frozen,
         comment=_comment(robot.name, num_spheres, num_base_spheres, seed),
     )
-    thin_spheres = _collect(proven)
-    draft = mujoco.MjModel.from_xml_string(write(thin=thin_spheres))
-    radii, is_used = thin.fit_radii(draft, found, allowed)
-    progress(f"thin spheres: {is_used.sum()} of {len(is_used)} take part in self-collision")
-    return write(
-        thin=text.BodySpheres(
-            body=thin_spheres.body[is_used],
-            centre=thin_spheres.centre[is_used],
-            radius=np.round(radii[is_used] / STEP) * STEP,
-        )
-    )
+    thin_spheres = thin.refine(model, _collect(proven), found, allowed, write)
+    progress(f"{len(thin_spheres.body)} spheres take part in self-collision")
+    return write(thin=thin_spheres, allowed=allowed)
 
 
 def _comment(name: str, num_spheres: int, num_base_spheres: int, seed: int) -> str:

@@ -1,12 +1,15 @@
 """Which spheres of a robot are checked against each other."""
 
+import collections
+import dataclasses
+
 import mujoco
 import numpy as np
 
 from vrrt_jax.robots import text
 from vrrt_jax.robots.mjcf import joint_ranges
 
-_SAMPLES = 500
+_NUM_DRAFT = 500
 _ALWAYS = 0.98  # a pair of bodies that touches more often than this is allowed to
 
 
@@ -45,31 +48,77 @@ def excluded(model: mujoco.MjModel) -> list[tuple[str, str]]:
     return found
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SelfCollisions:
+    """Random configurations of a robot with its true geometry."""
+
+    q: np.ndarray  # (n, D) [rad] or [m]
+    touching: list[set[tuple[int, int]]]  # (n,) pairs of bodies that touch, smaller index first
+
+
+def sample_self_collisions(
+    model: mujoco.MjModel, num: int, rng: np.random.Generator
+) -> SelfCollisions:
+    """Find out what touches what in random configurations.
+
+    Args:
+        model: the robot with its true geometry, and nothing else.
+        num: number of configurations.
+        rng: source of randomness.
+    """
+    data = mujoco.MjData(model)
+    q = rng.uniform(*joint_ranges(model), (num, model.njnt))
+    touching = []
+    for row in q:
+        data.qpos[:] = row
+        touching.append(touching_bodies(model, data))
+    return SelfCollisions(q=q, touching=touching)
+
+
+def _count(found: SelfCollisions) -> dict[tuple[int, int], int]:
+    """How often each pair of bodies touches."""
+    return collections.Counter(pair for pairs in found.touching for pair in pairs)
+
+
+def allowed_pairs(model: mujoco.MjModel, found: SelfCollisions) -> list[tuple[str, str]]:
+    """Pairs of bodies that need no check: they never touch, or nearly always do.
+
+    A body and the base that carries it are among them: they share a joint.
+
+    Args:
+        model: the robot with its true geometry.
+        found: random configurations.
+    """
+    count = _count(found)
+    bodies = np.unique(model.geom_bodyid)
+    weld = model.body_weldid
+    allowed = []
+    for a, b in ((int(a), int(b)) for a in bodies for b in bodies if a < b):
+        parents = weld[model.body_parentid[weld[[a, b]]]]
+        # C MuJoCo skips these by itself
+        if weld[a] == weld[b] or (weld[a] and weld[b] and weld[b] == parents[0]):
+            continue
+        if weld[a] and weld[b] and weld[a] == parents[1]:
+            continue
+        is_joined = weld[a] == 0 and parents[1] == 0
+        if is_joined or not 0 < count.get((a, b), 0) < _ALWAYS * len(found.q):
+            allowed.append((model.body(a).name, model.body(b).name))
+    return allowed
+
+
 def always_touching(model: mujoco.MjModel) -> list[tuple[str, str]]:
     """Pairs of bodies whose thin spheres touch at home, or nearly everywhere.
-
-    The base and the bodies that it carries are among them: MuJoCo checks those.
 
     Args:
         model: compiled from :func:`vrrt_jax.robots.text.collision_mjcf`.
     """
-    rng = np.random.default_rng(0)
-    lower, upper = joint_ranges(model)
+    found = sample_self_collisions(model, _NUM_DRAFT, np.random.default_rng(0))
     data = mujoco.MjData(model)
-    count: dict[tuple[int, int], int] = {}
-    for sample in range(_SAMPLES + 1):
-        data.qpos[:] = rng.uniform(lower, upper) if sample else model.key_qpos[0]
-        for pair in touching_bodies(model, data):
-            # one touch at home is as good as touching always
-            count[pair] = count.get(pair, 0) + (1 if sample else _SAMPLES)
-    for joint in np.flatnonzero(model.body_weldid[model.body_parentid[model.jnt_bodyid]] == 0):
-        moving = model.jnt_bodyid[joint]
-        count[int(model.body_parentid[moving]), int(moving)] = _SAMPLES
-    return [
-        (model.body(first).name, model.body(second).name)
-        for (first, second), times in sorted(count.items())
-        if times > _ALWAYS * _SAMPLES and _signature(first, second) not in model.exclude_signature
-    ]
+    data.qpos[:] = model.key_qpos[0]
+    pairs = touching_bodies(model, data) | {
+        pair for pair, times in _count(found).items() if times > _ALWAYS * _NUM_DRAFT
+    }
+    return [(model.body(first).name, model.body(second).name) for first, second in sorted(pairs)]
 
 
 def touching_bodies(model: mujoco.MjModel, data: mujoco.MjData) -> set[tuple[int, int]]:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 STEP = 1e-4  # [m] centres and radii of fitted spheres are multiples of this
-_ROUND = 32  # sides of the prism around a cylinder; the prism is at most 0.5 % wider
+_ROUND = 20  # sides of the prism around a cylinder, 1.2 % wider; 2.5 % for other round shapes
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -156,14 +156,14 @@ def contain_surface(
         triangles = piece.vertices[piece.triangles]
         others = [other for other in pieces if other is not piece]
         while len(triangles):
-            for other in others:  # what lies inside another piece is not surface
-                depth = other.depth(triangles.reshape(-1, 3)).reshape(-1, 3)
-                triangles = triangles[depth.min(1) < 0]
             corner_distance = np.linalg.norm(triangles[:, :, None] - centres, axis=-1)
             if not others:  # all corners are surface: gaps close here, before they are split
                 radii = grow(corner_distance.reshape(-1, len(radii)), radii)
             distance = corner_distance.max(1)
             is_bare = (distance > radii).all(1)
+            for other in others:  # what lies inside another piece is not surface
+                corners = triangles[is_bare].reshape(-1, 3)
+                is_bare[is_bare] = other.depth(corners).reshape(-1, 3).min(1) < 0
             triangles, distance = triangles[is_bare], distance[is_bare]
             edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=-1)
             is_leaf = edges.max(1, initial=0) < leaf

@@ -11,8 +11,10 @@ import numpy as np
 
 from vrrt_jax.core.kinematics import Chain, chain_from_model
 from vrrt_jax.core.types import Spheres
-from vrrt_jax.robots import mjcf, pairs, spheres, text
+from vrrt_jax.robots import mjcf, pairs, spheres, text, thin
 from vrrt_jax.robots.paths import robot_names, robot_path
+
+_NUM_SAMPLES = 20_000  # configurations, to see which bodies never touch
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,7 +70,7 @@ def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None =
     found = spheres.spheres_of(model)
     allowed = pairs.excluded(model)
     mesh_source = str(path.resolve())
-    if found.has_kinds:  # then they stand for geometry of another file, which this file names
+    if found.origin == "written":  # they stand for geometry of another file, which this one names
         mesh_source, fixed_before = text.source_of(spec)
         frozen = fixed_before | frozen
     fields = {
@@ -76,13 +78,16 @@ def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None =
         "mesh_source": mesh_source,
         "frozen": frozen,
     }
-    write = functools.partial(
-        text.collision_mjcf, model, cover=found.cover, thin=found.thin, home=home, **fields
-    )
-    if not found.has_kinds:
-        draft = mujoco.MjModel.from_xml_string(write(allowed=allowed))
+    write = functools.partial(text.collision_mjcf, model, cover=found.cover, home=home, **fields)
+    thin_spheres = found.thin
+    if found.origin != "written":
+        sample = pairs.sample_self_collisions(model, _NUM_SAMPLES, np.random.default_rng(0))
+        allowed = sorted({*allowed, *pairs.allowed_pairs(model, sample)})
+        if found.origin == "fitted":
+            thin_spheres = thin.refine(model, thin_spheres, sample, allowed, write)
+        draft = mujoco.MjModel.from_xml_string(write(thin=thin_spheres, allowed=allowed))
         allowed += pairs.always_touching(draft)
-    xml = write(allowed=allowed)
+    xml = write(thin=thin_spheres, allowed=allowed)
     return _robot(
         model=mujoco.MjModel.from_xml_string(xml), allowed=tuple(allowed), xml=xml, **fields
     )

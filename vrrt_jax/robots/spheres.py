@@ -1,6 +1,7 @@
 """Spheres that cover convex pieces."""
 
 import dataclasses
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -15,9 +16,10 @@ from vrrt_jax.robots.pieces import (
 )
 
 _SPACING = 0.004  # [m] between surface samples
-_NUM_SURFACE, _NUM_CENTRES = 2000, 600
+_NUM_SURFACE, _NUM_CENTRES = 2000, 600  # for a body and for a piece
 _LEAF = 2e-3  # [m]
-_BULGE = 0.03  # [m] how far spheres fitted on loading stick out
+_BULGE = 0.03  # [m] how far spheres fitted on loading stick out at most
+_RELATIVE_BULGE = 0.1  # of the extent of the body, if that is less
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -25,8 +27,10 @@ class RobotSpheres:
     """The spheres of a robot."""
 
     cover: text.BodySpheres  # cover the moving bodies
-    thin: text.BodySpheres  # follow the surface of all bodies
-    has_kinds: bool  # they were written as two kinds, with the pairs to ignore
+    thin: text.BodySpheres  # for self-collision, on all bodies
+    # "written" by fit_spheres, with the pairs to ignore; the file's "own"; or "fitted" just now:
+    # then the thin ones cover their bodies too, and are too large for self-collision
+    origin: Literal["written", "own", "fitted"]
 
 
 def spheres_of(model: mujoco.MjModel) -> RobotSpheres:
@@ -55,7 +59,7 @@ def spheres_of(model: mujoco.MjModel) -> RobotSpheres:
     return RobotSpheres(
         cover=_select(model, geoms[is_cover & is_moving]),
         thin=_select(model, geoms[is_thin]),
-        has_kinds=has_kinds,
+        origin="written" if has_kinds else "own",
     )
 
 
@@ -78,18 +82,25 @@ def _select(model: mujoco.MjModel, geoms: np.ndarray) -> text.BodySpheres:
 def _fitted(model: mujoco.MjModel) -> RobotSpheres:
     rng = np.random.default_rng(0)
     body, centre, radius = [], [], []
-    for index, pieces in collision_pieces(model).items():
-        centres, radii = cover_body(pieces, _BULGE, rng)
+    bodies = collision_pieces(model)
+    extents = {
+        index: np.ptp(np.vstack([piece.vertices for piece in pieces]), axis=0).max()
+        for index, pieces in bodies.items()
+    }
+    for index, pieces in bodies.items():
+        # fine for small bodies, but without spending most spheres on the smallest
+        own_bulge = max(extents[index], max(extents.values()) / 2) * _RELATIVE_BULGE
+        own_bulge = min(own_bulge, _BULGE)
+        centres, radii = cover_body(pieces, own_bulge, rng)
         body.append(np.full(len(radii), index))
         centre.append(centres)
         radius.append(radii)
-    bodies, centres, radii = np.hstack(body), np.vstack(centre), np.hstack(radius)
-    moves = model.body_weldid[bodies] != 0
+    owners, centres, radii = np.hstack(body), np.vstack(centre), np.hstack(radius)
+    moves = model.body_weldid[owners] != 0
     return RobotSpheres(
-        cover=text.BodySpheres(body=bodies[moves], centre=centres[moves], radius=radii[moves]),
-        # spheres that stick out always touch those of the next link but one
-        thin=text.BodySpheres(body=bodies, centre=centres, radius=radii - _BULGE / 2),
-        has_kinds=False,
+        cover=text.BodySpheres(body=owners[moves], centre=centres[moves], radius=radii[moves]),
+        thin=text.BodySpheres(body=owners, centre=centres, radius=radii),
+        origin="fitted",
     )
 
 
