@@ -150,6 +150,26 @@ def test_files_own_geometry_is_the_truth(pendulum):
     assert contacts(pendulum, [close], np.zeros(1), geometry="spheres") == ["arm touches close"]
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('joint name="joint7"', 'joint name="j"'), None),  # addressed by order
+        (('pos="0 0 0.333"', 'pos="0 0 0.350"'), "are placed 0.0170 m away"),
+        (('body name="hand"', 'body name="claw"'), "have no body hand; have: link0, link1"),
+    ],
+)
+def test_meshes_of_another_robot_are_refused(panda, tmp_path, change, message):
+    """The committed spheres play the meshes of some other version."""
+    path = tmp_path / "meshes.xml"
+    path.write_text(panda.xml.replace(*change))
+    robot = dataclasses.replace(panda, mesh_source=str(path))
+    if message is None:
+        assert contacts(robot, [], robot.home, geometry="meshes") == []
+        return
+    with pytest.raises(ValueError, match=message):
+        contacts(robot, [], robot.home, geometry="meshes")
+
+
 def test_typical_path_is_verified_in_time(panda):
     obstacles = [
         dataclasses.replace(FAR, name=f"post {k}", position=(-0.7, 0.1 * k, 0.5)) for k in range(8)

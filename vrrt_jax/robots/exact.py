@@ -21,7 +21,8 @@ _KINDS = {
 }
 _GEOMETRIES = ("auto", "meshes", "spheres")
 _ALL_BITS = 0x7FFFFFFF
-_SAME_ROBOT = 1e-3  # [m] between the link frames of meshes and of spheres at home
+_SAME_ROBOT = 1e-3  # [m] between the body frames of meshes and of spheres at home
+_OTHER_VERSION = "install the version of the meshes that the README names"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -128,7 +129,7 @@ def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> Exac
     for obstacle in obstacles:
         # spheres of the robot see bit 0 only, so that its thin ones ignore obstacles
         _add_obstacle(spec, obstacle, _ALL_BITS if has_meshes else 1)
-    spec.memory = 1 << 24  # room for the contacts of a robot deep inside an obstacle
+    spec.memory = 1 << 23  # room for the contacts of a robot deep inside an obstacle
     try:
         model = spec.compile()
     except ValueError as error:
@@ -152,23 +153,33 @@ def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> Exac
 
 
 def _check_same_robot(robot: Robot, meshes: mujoco.MjModel, spheres: mujoco.MjModel) -> None:
-    """Refuse meshes whose joints or link frames are not those of the spheres."""
+    """Refuse meshes whose joints or body frames are not those of the spheres."""
+    if meshes.nq != robot.num_joints:
+        raise ValueError(
+            f"the meshes of robot '{robot.name}' have {meshes.nq} joints; expected "
+            f"{robot.num_joints}: {_OTHER_VERSION}"
+        )
     frames = []
     for model in (meshes, spheres):
         data = mujoco.MjData(model)
-        if model.nq != robot.num_joints:
-            raise ValueError(
-                f"the meshes of robot '{robot.name}' have {model.nq} joints; expected "
-                f"{robot.num_joints}: install the version of the meshes that the README names"
-            )
         data.qpos[:] = robot.home
         mujoco.mj_kinematics(model, data)
-        frames.append([data.body(name).xpos for name in robot.link_names[1:]])
-    error = np.max(np.abs(np.subtract(*frames)))
+        frames.append({model.body(k).name: data.xpos[k] for k in range(1, model.nbody)})
+    missing = {*robot.cover_bodies, *robot.thin_bodies} - {"world", *frames[0]}
+    if missing:
+        raise ValueError(
+            f"the meshes of robot '{robot.name}' have no body {', '.join(sorted(missing))}; have: "
+            f"{', '.join(frames[0])}: {_OTHER_VERSION}"
+        )
+    error = max(
+        np.max(np.abs(position - frames[1][name]))
+        for name, position in frames[0].items()
+        if name in frames[1]
+    )
     if error > _SAME_ROBOT:
         raise ValueError(
             f"the meshes of robot '{robot.name}' are placed {error:.4f} m away from its collision "
-            "spheres; expected the same kinematics: install the version that the README names"
+            f"spheres; expected the same kinematics: {_OTHER_VERSION}"
         )
 
 

@@ -66,12 +66,16 @@ def strip_spec(spec: mujoco.MjSpec, *, visuals: bool) -> None:
     """Delete, in place, everything but bodies, joints, keys and geoms.
 
     Args:
-        spec: as read from the file; keyframes and equalities stay, see :func:`freeze_joints`.
+        spec: as read from the file; keyframes and equalities of joints stay, see
+            :func:`freeze_joints`.
         visuals: keep the geoms that never collide, with their meshes and materials.
     """
-    for name in ("sensors", "actuators", "tendons", "pairs", "flexes", "skins", "sites"):
+    for equality in list(spec.equalities):
+        if equality.type != mujoco.mjtEq.mjEQ_JOINT:
+            spec.delete(equality)
+    for name in ("tuples", "sensors", "actuators", "tendons", "pairs", "flexes", "skins"):
         _delete_all(spec, name)
-    for name in ("cameras", "lights"):
+    for name in ("sites", "cameras", "lights"):
         _delete_all(spec, name)
     for key in spec.keys:  # sized for the actuators that are gone
         key.ctrl, key.act = [], []

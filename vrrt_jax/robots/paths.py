@@ -38,7 +38,7 @@ def robot_path(name_or_path: str | Path) -> Path:
         ValueError: the name is not known.
     """
     text = str(name_or_path)
-    if isinstance(name_or_path, str) and text in robot_names():
+    if text in robot_names():
         return scenes_dir() / "robots" / text / "robot.xml"
     path = Path(name_or_path).expanduser()
     if path.is_file():
