@@ -38,6 +38,8 @@ RANGES = {
     "probes_kept": (1, np.inf),
     "probe_radius": (0.0, np.inf),
     "probe_px": (8, 4096),
+    "probe_alpha": (0.0, 1.0),
+    "probe_steps": (0, 100_000),
     "lanes": (1, 4096),
     "image_px": (8, 4096),
 }

@@ -57,6 +57,8 @@ class PlannerConfig:
     match_scale: float = 1.0  # the goal loss, in units of the self-model's calibrated bar
     probes: int = 1024  # renders around the start that seed the search (re-compiles)
     probe_radius: float = 2.8  # how far from it [rad]
+    probe_alpha: float = 0.06  # first of these steps, falling to zero [rad]
+    probe_steps: int = 60  # Adam steps that the kept ones take at that resolution
     probes_kept: int = 63  # best of them that become roots beside the start (re-compiles)
     probe_px: int = 32  # image height that they are rendered at (re-compiles)
     rewiring: bool = True  # RRT*
@@ -351,6 +353,7 @@ def visual_policy(
     coarse_goal, coarse_cameras = prepare_goal(goal_image, camera, config.probe_px)
     coarse = dataclasses.replace(
         policy,
+        alpha=jnp.float32(config.probe_alpha),
         splats=self_model.level_for(coarse_goal.coverage.shape[1]).splats,
         cameras=coarse_cameras,
         goal=coarse_goal,
@@ -358,6 +361,7 @@ def visual_policy(
     probing = Probing(
         policy=coarse,
         radius=jnp.float32(config.probe_radius),
+        steps=jnp.int32(config.probe_steps),
         num=config.probes,
         kept=min(config.probes, config.probes_kept),
     )

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import difference, normalise
+from vrrt_jax.core.edges import difference, into_limits
 from vrrt_jax.core.rewire import rewire
 from vrrt_jax.core.rrt import sample_configurations
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
@@ -162,6 +162,7 @@ class Probing:
 
     policy: VisualPolicy  # with the coarse goal; only its loss is used
     radius: jax.Array  # () largest distance from the start [rad]
+    steps: jax.Array  # () i32 Adam steps that each kept one takes
     num: int = static()  # configurations rendered; none gives the plain tree of the paper
     kept: int = static()  # best of them that become roots
 
@@ -191,6 +192,9 @@ def plant(
     if probing.num:
         q = jnp.concatenate([q, _best_probes(world, probing, q_start, key)])
     score, payload = policy.roots(world, q)
+    blocked = ~jax.vmap(is_free, (None, 0))(world, q)
+    score = jnp.where(blocked, jnp.finfo(score.dtype).max, score)
+    payload = dataclasses.replace(payload, exploited=blocked)
     cost = jnp.full(len(q), trees.UNREACHED).at[0].set(0.0)
     return trees.create(q, score, payload, capacity, cost)
 
@@ -201,9 +205,22 @@ def _best_probes(world: World, probing: Probing, q_start: jax.Array, key: jax.Ar
     direction = jax.random.normal(key_direction, (probing.num, len(q_start)))
     direction /= jnp.linalg.norm(direction, axis=1, keepdims=True)
     distance = probing.radius * jax.random.uniform(key_distance, (probing.num, 1))
-    q = q_start + distance * direction
-    q = jnp.where(world.wraps, normalise(world, q), jnp.clip(q, world.lower, world.upper))
-    loss = map_lanes(lambda q: probing.policy.loss(world, q), q)
-    loss = jnp.where(jax.vmap(is_free, (None, 0))(world, q), loss, jnp.inf)
-    _, best = jax.lax.top_k(-loss, probing.kept)
-    return q[best]
+    q = into_limits(world, q_start + distance * direction)
+    _, best = jax.lax.top_k(-map_lanes(lambda q: probing.policy.loss(world, q), q), probing.kept)
+    return _descend(world, probing, q[best])
+
+
+def _descend(world: World, probing: Probing, q: jax.Array) -> jax.Array:
+    """Follow the coarse image gradient from ``q`` (kept, D); what ends in collision goes back."""
+    adam = optax.scale_by_adam(b1=probing.policy.beta1, b2=probing.policy.beta2)
+    gradient = jax.grad(lambda q: probing.policy.loss(world, q))
+
+    def step(i, carry):
+        q, state = carry
+        direction, state = adam.update(map_lanes(gradient, q), state)
+        length = probing.policy.alpha * (1.0 - i / probing.steps)
+        return into_limits(world, q - length * direction), state
+
+    end, _ = jax.lax.fori_loop(0, probing.steps, step, (q, adam.init(q)))
+    free = jax.vmap(is_free, (None, 0))(world, end)
+    return jnp.where(free[:, None], end, q)

@@ -24,6 +24,11 @@ def normalise(world: World, q: jax.Array) -> jax.Array:
     return q - 2 * jnp.pi * turns
 
 
+def into_limits(world: World, q: jax.Array) -> jax.Array:
+    """The nearest configurations (..., D) inside the limits."""
+    return jnp.where(world.wraps, normalise(world, q), jnp.clip(q, world.lower, world.upper))
+
+
 def steer(world: World, q_from: jax.Array, target: jax.Array, max_length: jax.Array) -> jax.Array:
     """The step (..., D) towards a target, inside the limits and no longer than ``max_length``.
 

@@ -1,0 +1,52 @@
+import ast
+import re
+from pathlib import Path
+
+import vrrt_jax
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "vrrt_jax"
+
+
+def imports(file):
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield node.module or ""
+
+
+def test_every_public_name_resolves_and_has_a_docstring():
+    assert sorted(vrrt_jax.__all__) == vrrt_jax.__all__
+    for name in vrrt_jax.__all__:
+        assert getattr(vrrt_jax, name).__doc__, name
+
+
+def test_core_knows_neither_splats_nor_networks_nor_planners():
+    for file in (PACKAGE / "core").glob("*.py"):
+        for module in imports(file):
+            assert not module.startswith(("flax", "vrrt_jax.splat", "vrrt_jax.visual")), file.name
+            assert not module.startswith(("vrrt_jax.planner", "nrp_jax")), file.name
+
+
+def test_only_one_file_touches_mjx():
+    users = [
+        str(file.relative_to(PACKAGE))
+        for file in PACKAGE.rglob("*.py")
+        if any(m == "mujoco.mjx" or m.startswith("mujoco.mjx.") for m in imports(file))
+        or "from mujoco import mjx" in file.read_text()
+    ]
+    assert sorted(users) == ["bench/kinematics.py", "core/mjx_backend.py"]
+
+
+def test_files_are_short():
+    for file in PACKAGE.rglob("*.py"):
+        assert len(file.read_text().splitlines()) <= 560, file.name
+
+
+def test_the_readme_runs(tmp_path):
+    """The README's Python, as it stands there."""
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    scope = {}
+    exec(compile(code, "README.md", "exec"), scope)
+    assert scope["result"].ok

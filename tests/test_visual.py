@@ -1,0 +1,269 @@
+"""Visual-RRT: the frontier's law, Adam along a lineage, no re-compilation, a plan from a picture.
+
+Goal images here are rendered by the self-model, which is quick and needs no OpenGL; the packaged
+problems, whose images are MuJoCo's, are planned in test_cli.py.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import vrrt_jax
+from vrrt_jax import planner
+from vrrt_jax.core import search as searches
+from vrrt_jax.core.expand import expand
+from vrrt_jax.core.rewire import with_costs
+from vrrt_jax.core.tree import UNREACHED, lineage
+from vrrt_jax.splat.loss import goal_loss
+from vrrt_jax.visual import plant
+
+Q_START = np.array([-0.9, 0.5, 0.0, -1.6, 0.0, 2.0, 0.8], np.float32)
+Q_GOAL = np.array([-0.5, 0.3, 0.2, -1.9, 0.1, 2.2, 0.6], np.float32)
+SMALL = planner.PlannerConfig(
+    lanes=8, capacity=1024, image_px=32, probes=64, probes_kept=7, max_iterations=150
+)
+
+
+@pytest.fixture(scope="module")
+def self_model(panda):
+    return vrrt_jax.load_self_model(vrrt_jax.problems.self_model_path(panda))
+
+
+@pytest.fixture(scope="module")
+def camera():
+    return vrrt_jax.look_at((1.7, -1.2, 1.1), (0.1, 0.0, 0.4), height=96, width=128)
+
+
+def picture(panda, self_model, camera, q):
+    splats = self_model.levels[1].splats
+    poses = vrrt_jax.link_poses(panda.chain, jnp.asarray(q))
+    rgb, coverage = jax.jit(vrrt_jax.render)(splats, poses, camera)
+    straight = rgb / jnp.maximum(coverage, 1e-3)[..., None]
+    return np.clip(np.concatenate([straight, coverage[..., None]], axis=-1), 0, 1)
+
+
+@pytest.fixture(scope="module")
+def image(panda, self_model, camera):
+    return picture(panda, self_model, camera, Q_GOAL)
+
+
+@pytest.fixture(scope="module")
+def open_world(panda):
+    ball = vrrt_jax.Obstacle(name="ball", kind="sphere", position=(0, 0.9, 0.9), size=(0.1, 0, 0))
+    return vrrt_jax.build_world(panda, [ball])
+
+
+@pytest.fixture(scope="module")
+def policy(panda, self_model, camera, image):
+    found, probing, _ = planner.visual_policy(
+        panda, self_model, camera, image, Q_START, dataclasses.replace(SMALL, probes=0)
+    )
+    return found, probing
+
+
+def grown(world, policy, iterations, **changes):
+    policy, probing = policy
+    policy = dataclasses.replace(policy, **changes)
+    tree = plant(world, policy, probing, jnp.asarray(Q_START), jax.random.key(1), 1024)
+    step = jax.jit(expand)
+    for _ in range(iterations):
+        tree = step(world, policy, tree, jax.random.key(0))
+    return tree, policy
+
+
+def test_frontier_law(policy):
+    visual, _ = policy
+    for m, eta, kappa in ((1, 0.7, 0.9), (40, 1.0, 0.9), (40, 0.4, 0.5)):
+        visual = dataclasses.replace(
+            visual, eta=jnp.float32(eta), kappa=jnp.float32(kappa), lanes=1
+        )
+        allowed = jnp.arange(64) < m
+        keys = jax.random.split(jax.random.key(0), 20_000)
+        place, ok = jax.vmap(lambda key: visual._draw(allowed, key))(keys)  # noqa: B023
+        assert bool(jnp.all(ok))
+        share = np.bincount(np.asarray(place[:, 0]), minlength=64) / len(keys)
+        k = np.arange(m)
+        law = eta * (1 - kappa) * kappa**k / (1 - kappa**m) + (1 - eta) / m
+        assert law.sum() == pytest.approx(1)
+        np.testing.assert_allclose(share[:m], law, atol=0.012)
+        assert share[m:].sum() == 0
+
+
+def test_draws_are_distinct_and_reported_when_they_run_out(policy):
+    visual, _ = policy
+    place, ok = visual._draw(jnp.arange(64) < 5, jax.random.key(0))
+    assert int(ok.sum()) == 5
+    assert sorted(np.asarray(place)[np.asarray(ok)]) == [0, 1, 2, 3, 4]
+
+
+def test_a_branch_without_exploration_is_plain_adam(policy, open_world):
+    tree, visual = grown(
+        open_world,
+        policy,
+        6,
+        exploration=jnp.float32(0),
+        kappa=jnp.float32(0.0),
+        eta=jnp.float32(1.0),
+        anneal_loss=jnp.float32(0),
+        rewiring=False,
+    )
+    adam = optax.scale_by_adam(b1=0.9, b2=0.9)
+    gradient = jax.jit(jax.grad(lambda q: visual.loss(open_world, q)))
+    q, state = jnp.asarray(Q_START), adam.init(jnp.asarray(Q_START))
+    chain = [q]
+    for _ in range(6):
+        direction, state = adam.update(gradient(q), state)
+        q = q - 0.04 * direction
+        chain.append(q)
+    exploited = [int(np.argmax(np.asarray(tree.payload.adam.count[: int(tree.size)])))]
+    nodes = lineage(tree, exploited[0])
+    count = np.asarray(tree.payload.adam.count)[nodes]
+    np.testing.assert_array_equal(count, np.arange(len(nodes)))
+    np.testing.assert_allclose(np.asarray(tree.q)[nodes], chain[: len(nodes)], atol=2e-3)
+    assert len(nodes) >= 4
+
+
+def test_explored_children_start_fresh_and_step_epsilon(policy, open_world):
+    tree, _ = grown(open_world, policy, 4, exploration=jnp.float32(1.0), rewiring=False)
+    size = int(tree.size)
+    assert size == 1 + 4 * 8
+    assert np.all(np.asarray(tree.payload.adam.count[:size]) == 0)
+    assert np.all(np.asarray(tree.payload.adam.mu[:size]) == 0)
+    step = np.linalg.norm(tree.q[1:size] - tree.q[tree.parent[1:size]], axis=1)
+    assert np.all(step < 0.04 + 1e-5) and np.median(step) > 0.0399
+    assert not np.any(tree.payload.exploited)
+
+
+def test_stored_gradients_are_those_of_the_loss(policy, open_world):
+    tree, visual = grown(open_world, policy, 3)
+    size = int(tree.size)
+    expected = jax.jit(jax.vmap(jax.grad(lambda q: visual.loss(open_world, q))))(tree.q[:size])
+    np.testing.assert_allclose(tree.payload.grad[:size], expected, rtol=2e-3, atol=1e-5)
+
+
+def test_costs_stay_right_under_rewiring(policy, open_world):
+    tree, _ = grown(open_world, policy, 12)
+    np.testing.assert_allclose(with_costs(open_world, tree).cost, tree.cost, atol=2e-4)
+
+
+def test_probes_are_free_near_and_look_alike(panda, self_model, camera, image, wall_world, free):
+    visual, probing, _ = planner.visual_policy(panda, self_model, camera, image, Q_START, SMALL)
+    q_start = jnp.asarray(Q_START)
+    tree = jax.jit(plant, static_argnums=5)(
+        wall_world, visual, probing, q_start, jax.random.key(0), 512
+    )
+    roots = np.asarray(tree.q[1 : int(tree.size)])
+    assert len(roots) == 7
+    assert np.all(np.asarray(free(wall_world, roots)))
+    assert np.linalg.norm(roots - Q_START, axis=1).max() <= 2.8 + 1e-4
+    assert np.all(np.asarray(tree.cost[1:8]) == UNREACHED) and float(tree.cost[0]) == 0
+    others = panda.lower + np.random.default_rng(0).random((64, 7)) * (panda.upper - panda.lower)
+    loss = jax.jit(jax.vmap(lambda q: probing.policy.loss(wall_world, q)))
+    assert np.median(loss(roots)) < np.median(loss(others.astype(np.float32)))
+
+
+def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
+    panda, self_model, camera, image, open_world, monkeypatch
+):
+    traces = []
+    original = searches.run_chunk
+
+    def counted(*args):
+        traces.append(1)
+        return original(*args)
+
+    monkeypatch.setattr(searches, "_chunk", jax.jit(counted))
+
+    def run(world=open_world, image=image, q_start=Q_START, model=self_model, **changes):
+        return vrrt_jax.plan(
+            panda,
+            world,
+            model,
+            camera,
+            image,
+            q_start,
+            key=jax.random.key(0),
+            config=dataclasses.replace(SMALL, **changes),
+        )
+
+    result = run()
+    assert result.ok and result.verification is not None and result.verification.ok
+    assert np.abs(result.q_goal - Q_GOAL).mean() < 0.05
+    np.testing.assert_allclose(result.path[0], Q_START, atol=1e-6)
+    again = run()
+    np.testing.assert_array_equal(result.path, again.path)
+
+    moved = vrrt_jax.move_obstacle(open_world, "ball", position=(0.0, -0.9, 0.9))
+    lighter = dataclasses.replace(
+        self_model,
+        levels=tuple(
+            dataclasses.replace(
+                level, splats=dataclasses.replace(level.splats, rgb=0.9 * level.splats.rgb)
+            )
+            for level in self_model.levels
+        ),
+    )
+    few = {"max_iterations": 4}
+    run(world=moved, **few)
+    run(image=picture(panda, self_model, camera, Q_GOAL + 0.1), **few)
+    run(q_start=Q_START + 0.1, **few)
+    run(model=lighter, **few)
+    run(alpha=0.02, epsilon=0.1, kappa=0.5, eta=0.3, exploration=0.5, beta1=0.5, **few)
+    assert len(traces) == 1
+    run(lanes=4, **few)
+    assert len(traces) == 2
+
+
+def test_batch_equals_single_plans(panda, self_model, camera, image, open_world):
+    config = dataclasses.replace(SMALL, max_iterations=10, settle=0, rewiring=False)
+    other = picture(panda, self_model, camera, Q_GOAL + 0.2)
+    key = jax.random.key(5)
+    starts = np.stack([Q_START, Q_START + 0.05])
+    batch = vrrt_jax.plan_batch(
+        panda, open_world, self_model, camera, [image, other], starts, key=key, config=config
+    )
+    for i, goal in enumerate((image, other)):
+        single = vrrt_jax.plan(
+            panda,
+            open_world,
+            self_model,
+            camera,
+            goal,
+            starts[i],
+            key=jax.random.fold_in(key, i),
+            config=config,
+        )
+        size = int(single.tree.size)
+        assert int(batch[i].tree.size) == size
+        assert batch[i].status is single.status
+        # Sums of floats differ in order, and sign-like Adam steps amplify it: compare early nodes.
+        np.testing.assert_allclose(batch[i].tree.q[:16], single.tree.q[:16], atol=1e-3)
+
+
+def test_several_views_and_masks(panda, self_model, camera, image, open_world):
+    second = vrrt_jax.look_at((-0.4, 1.9, 0.9), (0.1, 0.0, 0.4), height=96, width=128)
+    images = [image, picture(panda, self_model, second, Q_GOAL)]
+    visual, _, _ = planner.visual_policy(
+        panda, self_model, [camera, second], images, Q_START, SMALL
+    )
+    assert visual.goal.rgb.shape[0] == 2
+    at_goal, at_start = (
+        float(goal_loss(panda.chain, visual.splats, visual.cameras, visual.goal, jnp.asarray(q)))
+        for q in (Q_GOAL, Q_START)
+    )
+    assert at_goal < 0.1 * at_start
+
+
+def test_joint_goals(panda, wall_world):
+    goal = Q_START * np.array([-1, 1, 1, 1, 1, 1, 1], np.float32)
+    result = vrrt_jax.plan_to_configuration(panda, wall_world, Q_START, goal, key=jax.random.key(0))
+    assert result.ok
+    np.testing.assert_allclose(result.path[[0, -1]], [Q_START, goal], atol=1e-5)
+    with pytest.raises(ValueError, match="unknown planner 'prm'; have: rrt, rrt-star"):
+        vrrt_jax.plan_to_configuration(
+            panda, wall_world, Q_START, goal, key=jax.random.key(0), planner="prm"
+        )
