@@ -4,15 +4,24 @@ The footprint of an isotropic Gaussian is a row profile times a column profile, 
 splats' features over the image is one product of matrices, and its gradient two more. There is no
 sort, no tile and no cut-off: every splat keeps a gradient. Occlusion is a soft z-buffer: colours
 are averaged with weights that fall off with depth behind the nearest splat.
+
+On a CPU most of those products multiply by zero. With :func:`choose_windows` neighbouring splats
+are summed over a small window of the image, and the windows are added. Neighbours that do not fit
+their window in some pose are summed over the whole image, so that the picture stays the same.
 """
 
+import dataclasses
 import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jax.custom_batching import custom_vmap
 
-from vrrt_jax.splat.camera import project
+from vrrt_jax.core.types import pytree, static
 from vrrt_jax.splat.types import Camera, SplatModel
 
 NEAR = 0.05  # [m] splats nearer than this to the camera plane are not drawn
@@ -21,49 +30,70 @@ PIXEL_BLUR = 0.1  # [px] a pixel's own footprint, added to every splat's; more c
 # number. So a splat keeps its colour however far it is behind the nearest one.
 MIN_LOG_WEIGHT = -66.0
 MIN_WEIGHT = 1e-37
+FAINTEST = 1e-3  # what a splat may add to colour or coverage outside its window
 
 
-def render(model: SplatModel, poses: jax.Array, camera: Camera) -> tuple[jax.Array, jax.Array]:
-    """Render a posed robot.
+@pytree
+class Windows:
+    """How to cut a rendering into small products; from :func:`choose_windows`."""
+
+    cluster: int = static()  # every so many consecutive splats share a window
+    px: int = static()  # height and width of a window
+
+
+class _Splats(NamedTuple):
+    """Splats in the image; the gradient has the same form."""
+
+    pixel: jax.Array  # (2, G) x, y [px]
+    inv_sigma: jax.Array  # (G,) [1/px]
+    features: jax.Array  # (C, G)
+
+
+class _Places(NamedTuple):
+    """Where the windows of an image are."""
+
+    corner: jax.Array  # (2, K) i32 left, top [px]
+    fits: jax.Array  # (K,) bool, all that the cluster shows is in its window
+
+
+def render(
+    model: SplatModel, poses: jax.Array, camera: Camera, windows: Windows | None = None
+) -> tuple[jax.Array, jax.Array]:
+    """Render a posed robot; ``vmap`` it for many.
 
     Args:
         model: splats bound to links.
         poses: (L, 4, 4) link-to-world transforms.
         camera: the view; its size is the image's.
+        windows: from :func:`choose_windows`, for the model that came with it.
 
     Returns:
         rgb (H, W, 3), the robot over black, and coverage (H, W).
     """
-    rotation, translation = poses[model.link, :3, :3], poses[model.link, :3, 3]
-    mean = jnp.einsum("gij,gj->gi", rotation, model.mean) + translation
-    pixel, depth = project(camera, mean)
-    visible = depth > NEAR
-    depth = jnp.where(visible, depth, 1.0)
-    sigma = jnp.sqrt((camera.focal * model.radius / depth) ** 2 + PIXEL_BLUR**2)
-    eye = -camera.world_to_cam[:3, :3].T @ camera.world_to_cam[:3, 3]
-    to_eye = eye - mean
-    to_eye = to_eye * jax.lax.rsqrt(jnp.sum(to_eye**2, -1, keepdims=True) + 1e-12)
-    view = jnp.einsum("gij,gi->gj", rotation, to_eye)
-    colour = model.rgb * (1.0 + jnp.sum(model.shade * view, -1, keepdims=True))
-    density = jnp.where(visible, model.density, 0.0)
-    nearest = jnp.min(jnp.where(visible, depth, jnp.inf))
-    nearest = jax.lax.stop_gradient(jnp.where(jnp.isfinite(nearest), nearest, 1.0))
-    behind = jnp.where(visible, (nearest - depth) / model.tau, 0.0)
-    weight = density * jnp.exp(jnp.maximum(behind, MIN_LOG_WEIGHT))
-    features = jnp.concatenate(
-        [weight[:, None] * colour, weight[:, None], density[:, None]], axis=-1
-    )
-    total = splat_sum(pixel, 1.0 / sigma, features, (camera.height, camera.width))
-    coverage = 1.0 - jnp.exp(-total[..., 4])
-    return _ratio(total[..., :3], total[..., 3]) * coverage[..., None], coverage
+    size = (camera.height, camera.width)
+    splats, depth = _project(model, poses, camera)
+    places = None
+    if windows is not None:
+        low, high = _extents(splats, depth, model.tau, windows.cluster, size)
+        room = jnp.array([[camera.width - windows.px], [camera.height - windows.px]])
+        corner = jnp.minimum(low, room)
+        places = _Places(corner, jnp.all(high <= corner + windows.px, axis=0))
+    rgb, coverage = _composite(_image(splats, places, size, windows))
+    return jnp.moveaxis(rgb, 0, -1), coverage
+
+
+def map_lanes(f: Callable, *args: Any) -> Any:
+    """Map ``f``, which renders, over the leading axis of all arguments' leaves.
+
+    Like ``vmap``, but with the memory of 32 lanes however many there are.
+    """
+    return lax.map(lambda lane: f(*lane), args, batch_size=32)
 
 
 def splat_sum(
     pixel: jax.Array, inv_sigma: jax.Array, features: jax.Array, size: tuple[int, int]
 ) -> jax.Array:
     """Sum over splats of Gaussian footprint times feature.
-
-    The gradient is in closed form: one product of matrices forward, two more backward.
 
     Args:
         pixel: (G, 2) centres x, y [px].
@@ -74,72 +104,299 @@ def splat_sum(
     Returns:
         (H, W, C).
     """
-    height, width = size
-    total = _sum(pixel, inv_sigma, features, size)
-    return total.reshape(width, features.shape[1], height).transpose(2, 0, 1)
+    splats = _Splats(pixel.T, inv_sigma, features.T)
+    return jnp.moveaxis(_image(splats, None, size, None), 0, -1)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _sum(pixel, inv_sigma, features, size):
-    """As splat_sum, but (W, C*H): the layout in which all three products are fast."""
-    return _sum_fwd(pixel, inv_sigma, features, size)[0]
-
-
-def _sum_fwd(pixel, inv_sigma, features, size):
-    height, width = size
-    dx = _offsets(pixel[:, 0], inv_sigma, width)
-    dy = _offsets(pixel[:, 1], inv_sigma, height)
-    gx, gy = jnp.exp(-0.5 * dx**2), jnp.exp(-0.5 * dy**2)
-    fy = (features[:, :, None] * gy[:, None]).reshape(features.shape[0], -1)
-    return gx.T @ fy, (dx, dy, gx, gy, fy, inv_sigma, features)
-
-
-def _sum_bwd(size, residuals, total_bar):
-    dx, dy, gx, gy, fy, inv_sigma, features = residuals
-    height, width = size
-    channels = features.shape[1]
-    # XLA's CPU loops for a product fused into a sum are ten times slower than the same sums
-    # written as products with matrices of zeros and ones.
-    over_rows = jnp.repeat(jnp.eye(channels, dtype=gx.dtype), height, axis=0)
-    over_pixels = jnp.repeat(
-        jnp.eye(2, dtype=gx.dtype), np.array([width, height]), axis=0, total_repeat_length=sum(size)
+def _project(model: SplatModel, poses: jax.Array, camera: Camera) -> tuple[_Splats, jax.Array]:
+    """Splats with features weighted rgb, weight, density; and depths (G,) [m]."""
+    # Small products in place of a gather of poses, whose gradient is a slow scatter.
+    link_to_cam = jnp.matmul(camera.world_to_cam, poses, precision="highest")[:, :3]
+    of_link = jax.nn.one_hot(model.link, len(poses), dtype=poses.dtype, axis=0)
+    mean = jnp.concatenate([model.mean.T, jnp.ones_like(model.radius)[None]])
+    point = _by_link(link_to_cam, of_link, mean)
+    shade = _by_link(link_to_cam[:, :, :3], of_link, model.shade.T)
+    visible = point[2] > NEAR
+    depth = jnp.where(visible, point[2], 1.0)
+    away = lax.rsqrt(point[0] ** 2 + point[1] ** 2 + point[2] ** 2 + 1e-12) * point
+    lit = 1.0 - (away[0] * shade[0] + away[1] * shade[1] + away[2] * shade[2])
+    density = jnp.where(visible, model.density, 0.0)
+    nearest = jnp.min(jnp.where(visible, depth, jnp.inf))
+    nearest = lax.stop_gradient(jnp.where(jnp.isfinite(nearest), nearest, 1.0))
+    behind = jnp.where(visible, (nearest - depth) / model.tau, 0.0)
+    weight = density * jnp.exp(jnp.maximum(behind, MIN_LOG_WEIGHT))
+    splats = _Splats(
+        pixel=camera.focal * point[:2] / depth + camera.centre[:, None],
+        inv_sigma=lax.rsqrt((camera.focal * model.radius / depth) ** 2 + PIXEL_BLUR**2),
+        features=jnp.concatenate([model.rgb.T * (weight * lit), weight[None], density[None]]),
     )
-    gx_bar = fy @ jax.lax.optimization_barrier(total_bar.T)
-    products = (gx @ total_bar).reshape(-1, channels, height) * gy[:, None]
-    products = products.reshape(-1, channels * height)
-    features_bar = products @ over_rows
-    along_y = sum(
-        products[:, c * height : (c + 1) * height] * features[:, c : c + 1] for c in range(channels)
+    return splats, depth
+
+
+def _by_link(matrices: jax.Array, of_link: jax.Array, vectors: jax.Array) -> jax.Array:
+    """Matrices (L, 3, n) of links times vectors (n, G) of splats, bound by ``of_link`` (L, G)."""
+    bound = (of_link[:, None] * vectors).reshape(-1, vectors.shape[1])
+    side_by_side = jnp.moveaxis(matrices, 0, 1).reshape(3, -1)
+    return jnp.dot(side_by_side, bound, precision="highest")
+
+
+@jax.custom_vjp
+def _composite(total: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Colour (3, H, W) and coverage (H, W) from sums (5, H, W) of weighted rgb, weight, density."""
+    return _composite_fwd(total)[0]
+
+
+def _composite_fwd(total):
+    coverage = 1.0 - jnp.exp(-total[4])
+    # Weights may be so small that their square, which automatic derivatives take, underflows.
+    inverse = 1.0 / (total[3] + MIN_WEIGHT)
+    colour = total[:3] * inverse
+    return (colour * coverage, coverage), (colour, coverage, inverse)
+
+
+def _composite_bwd(residuals, bars):
+    (colour, coverage, inverse), (rgb_bar, coverage_bar) = residuals, bars
+    along = sum(rgb_bar[c] * colour[c] for c in range(3))
+    weighted_bar = rgb_bar * (coverage * inverse)
+    weight_bar = -along * (coverage * inverse)
+    density_bar = (coverage_bar + along) * (1.0 - coverage)
+    return (jnp.concatenate([weighted_bar, weight_bar[None], density_bar[None]]),)
+
+
+_composite.defvjp(_composite_fwd, _composite_bwd)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+def _image(splats: _Splats, places: _Places | None, size, windows: Windows | None) -> jax.Array:
+    """Sum (C, H, W) over splats of footprint times feature."""
+    return _image_fwd(splats, places, size, windows)[0]
+
+
+def _image_fwd(splats, places, size, windows):
+    whole = functools.partial(_sum_whole, size)
+    cut = whole if windows is None else functools.partial(_sum_windows, size, windows)
+    return _each_lane(cut, whole)(splats, places), (splats, places)
+
+
+def _image_bwd(size, windows, residuals, image_bar):
+    splats, places = residuals
+    cut = _sum_whole_bar if windows is None else functools.partial(_sum_windows_bar, windows)
+    return _each_lane(cut, _sum_whole_bar)(splats, places, image_bar), None
+
+
+_image.defvjp(_image_fwd, _image_bwd)
+
+
+def _sum_whole(size, splats, places=None):
+    return _products(_clusters(splats, 1), jnp.zeros((2, 1), jnp.int32), size)[0]
+
+
+def _sum_whole_bar(splats, places, image_bar):
+    corner = jnp.zeros((2, 1), jnp.int32)
+    return jax.tree.map(
+        lambda bar: bar[0], _products_bar(_clusters(splats, 1), corner, image_bar[None])
     )
-    along = jnp.concatenate([gx_bar * gx * dx, along_y * dy], axis=1)
-    pixel_bar = (along @ over_pixels) * inv_sigma[:, None]
-    squares = along * jnp.concatenate([dx, dy], axis=1)
-    inv_sigma_bar = -jnp.sum(squares @ over_pixels, axis=1) / inv_sigma
-    return pixel_bar, inv_sigma_bar, features_bar
 
 
-_sum.defvjp(_sum_fwd, _sum_bwd)
+def _sum_windows(size, windows, splats, places):
+    clusters = _clusters(splats, len(places.fits))
+    inside = jnp.where(places.fits[:, None, None], clusters.features, 0.0)
+    window = (windows.px, windows.px)
+    sums = _products(clusters._replace(features=inside), places.corner, window)
+    order = jnp.argsort(places.fits)
+
+    def add(k, image):
+        left, top = places.corner[:, k]
+        old = lax.dynamic_slice(image, (0, top, left), sums.shape[1:])
+        return lax.dynamic_update_slice(image, old + sums[k], (0, top, left))
+
+    def add_outside(i, image):
+        return image + _sum_whole(size, jax.tree.map(lambda a: a[order[i]], clusters))
+
+    image = jnp.zeros((sums.shape[1], *size), sums.dtype)
+    image = lax.fori_loop(0, len(order), add, image)
+    return lax.fori_loop(0, jnp.sum(~places.fits), add_outside, image)
 
 
-def _offsets(centre: jax.Array, inv_sigma: jax.Array, n: int) -> jax.Array:
-    """Distances (G, n) of n pixels from the centres, in standard deviations."""
-    return (jnp.arange(n, dtype=centre.dtype) + 0.5 - centre[:, None]) * inv_sigma[:, None]
+def _sum_windows_bar(windows, splats, places, image_bar):
+    clusters = _clusters(splats, len(places.fits))
+    window = (len(image_bar), windows.px, windows.px)
+    left, top = places.corner
+    sums_bar = jax.vmap(lambda x, y: lax.dynamic_slice(image_bar, (0, y, x), window))(left, top)
+    bars = _products_bar(clusters, places.corner, sums_bar)
+    order = jnp.argsort(places.fits)
+
+    def replace(i, bars):
+        splats = jax.tree.map(lambda a: a[order[i]], clusters)
+        bar = _sum_whole_bar(splats, None, image_bar)
+        return jax.tree.map(lambda all, one: all.at[order[i]].set(one), bars, bar)
+
+    bars = lax.fori_loop(0, jnp.sum(~places.fits), replace, bars)
+    return jax.tree.map(lambda a, bar: jnp.moveaxis(bar, 0, -2).reshape(a.shape), splats, bars)
 
 
-@jax.custom_jvp
-def _ratio(colour: jax.Array, weight: jax.Array) -> jax.Array:
-    """Colour / weight for weights that may be so small that their square underflows."""
-    return colour / (weight[..., None] + MIN_WEIGHT)
+def _clusters(splats: _Splats, num: int) -> _Splats:
+    """From (..., G) to (num, ..., G / num)."""
+    return jax.tree.map(lambda a: jnp.moveaxis(a.reshape(*a.shape[:-1], num, -1), -2, 0), splats)
 
 
-@_ratio.defjvp
-def _ratio_jvp(primals, tangents):
-    (colour, weight), (colour_dot, weight_dot) = primals, tangents
-    inverse = 1.0 / (weight[..., None] + MIN_WEIGHT)
-    ratio = colour * inverse
-    return ratio, (colour_dot - ratio * weight_dot[..., None]) * inverse
+def _products(clusters: _Splats, corner: jax.Array, window: tuple[int, int]) -> jax.Array:
+    """Sums (K, C, h, w) over each cluster's splats, in its window."""
+    (_, gx), (_, gy) = _profiles(clusters, corner, window)
+    rows = (clusters.features[:, :, None] * gy[:, None]).reshape(len(gy), -1, gy.shape[-1])
+    return (rows @ jnp.swapaxes(gx, 1, 2)).reshape(len(gy), -1, *window)
 
 
-def map_lanes(f, *args: jax.Array):
-    """Map ``f`` over the leading axis of the arguments, a few at a time, so that caches hold."""
-    return jax.lax.map(lambda lane: f(*lane), args, batch_size=4)
+def _products_bar(clusters: _Splats, corner: jax.Array, sums_bar: jax.Array) -> _Splats:
+    num, channels, height, width = sums_bar.shape
+    features = clusters.features
+    (dx, gx), (dy, gy) = _profiles(clusters, corner, (height, width))
+    rows = (features[:, :, None] * gy[:, None]).reshape(num, channels * height, -1)
+    sums_bar = sums_bar.reshape(num, channels * height, width)
+    gx_bar = jnp.swapaxes(sums_bar, 1, 2) @ rows
+    rows_bar = (sums_bar @ gx).reshape(num, channels, height, -1)
+    gy_bar = sum(rows_bar[:, c] * features[:, c, None] for c in range(channels))
+    along_x, along_y = gx_bar * gx, gy_bar * gy
+    pixel_bar = jnp.stack([_over_pixels(along_x, dx), _over_pixels(along_y, dy)], axis=1)
+    squares = _over_pixels(along_x, dx * dx) + _over_pixels(along_y, dy * dy)
+    scale = clusters.inv_sigma
+    features_bar = _over_pixels(rows_bar, gy[:, None])
+    return _Splats(pixel_bar * scale[:, None], -squares / scale, features_bar)
+
+
+def _over_pixels(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Sum of a * b over the last axis but one.
+
+    XLA's CPU loops for the sum of a product are ten times slower than a chain of additions, which
+    for its part takes long to compile if there are many.
+    """
+    num = a.shape[-2]
+    if num > 64:
+        return (jnp.ones((1, num), a.dtype) @ (a * b))[..., 0, :]
+    return sum(a[..., i, :] * b[..., i, :] for i in range(num))
+
+
+def _profiles(clusters: _Splats, corner: jax.Array, window: tuple[int, int]):
+    """For x and y: offsets (K, n, g) of n pixels in standard deviations, and footprints."""
+    profiles = []
+    for axis, n in ((0, window[1]), (1, window[0])):
+        centre = clusters.pixel[:, axis] - corner[axis][:, None]
+        pixel = jnp.arange(n, dtype=centre.dtype)[:, None] + 0.5
+        offset = (pixel - centre[:, None]) * clusters.inv_sigma[:, None]
+        profiles.append((offset, jnp.exp(-0.5 * offset**2)))
+    return profiles
+
+
+def _each_lane(on_cpu: Callable, elsewhere: Callable) -> Callable:
+    """One lane after the other on a CPU, whose caches hold no more; all at once elsewhere.
+
+    Both functions take and give one lane. All ``vmap`` around the result become one leading axis.
+    """
+
+    @custom_vmap
+    def lanes(*args):
+        in_turn = functools.partial(_in_turn, on_cpu)
+        return lax.platform_dependent(*args, cpu=in_turn, default=jax.vmap(elsewhere))
+
+    @lanes.def_vmap
+    def _merge(num, batched, *args):
+        def merge(array, is_batched):
+            array = array if is_batched else jnp.broadcast_to(array, (num, *array.shape))
+            return array.reshape(-1, *array.shape[2:])
+
+        out = lanes(*jax.tree.map(merge, args, tuple(batched)))
+        out = jax.tree.map(lambda a: a.reshape(num, -1, *a.shape[1:]), out)
+        return out, jax.tree.map(lambda _: True, out)
+
+    def one(*args):
+        return jax.tree.map(lambda a: a[0], lanes(*jax.tree.map(lambda a: a[None], args)))
+
+    return one
+
+
+def _in_turn(function: Callable, *args: Any) -> Any:
+    """Like ``lax.map``, but copies each lane's inputs before they are used.
+
+    XLA would fuse their slicing into every use and repeat it for each output element; passing them
+    on from the turn before prevents that.
+    """
+    num = len(jax.tree.leaves(args)[0])
+
+    def lane(i):
+        return jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, i, keepdims=False), args)
+
+    def turn(current, i):
+        return lane(jnp.minimum(i + 1, num - 1)), function(*current)
+
+    return lax.scan(turn, lane(0), jnp.arange(num))[1]
+
+
+def _extents(splats: _Splats, depth, tau, cluster: int, size) -> tuple[jax.Array, jax.Array]:
+    """First and last pixels (2, K) x, y that clusters reach.
+
+    A splat may outshine one far behind it even where its own footprint is faint, so that its reach
+    grows with the depth behind it.
+    """
+    density = splats.features[-1]
+    shows = density > FAINTEST
+    farthest = jnp.max(jnp.where(shows, depth, -jnp.inf))
+    over = jnp.log(density / FAINTEST) + jnp.minimum((farthest - depth) / tau, -MIN_LOG_WEIGHT)
+    reach = jnp.sqrt(2.0 * jnp.maximum(over, 0.0)) / splats.inv_sigma
+    low = jnp.where(shows, splats.pixel - reach, jnp.inf).reshape(2, -1, cluster)
+    high = jnp.where(shows, splats.pixel + reach, -jnp.inf).reshape(2, -1, cluster)
+    end = jnp.array([[size[1]], [size[0]]])
+    low = jnp.clip(jnp.floor(jnp.min(low, axis=-1)), 0, end)
+    return low.astype(jnp.int32), jnp.clip(jnp.max(high, axis=-1), 0, end)
+
+
+def choose_windows(
+    model: SplatModel, poses: jax.Array, camera: Camera
+) -> tuple[SplatModel, Windows | None]:
+    """Group splats into clusters of neighbours on one link, and find windows that hold them.
+
+    Args:
+        model: splats bound to links.
+        poses: (n, L, 4, 4) link-to-world transforms of some tens of typical configurations.
+        camera: the view.
+
+    Returns:
+        The same model in another order, with copies of no density that fill up the clusters, and
+        the windows to :func:`render` it with. The model as it was and None if no window smaller
+        than 5/8 of the image holds 95 % of the clusters.
+    """
+    mean, link = np.asarray(model.mean), np.asarray(model.link)
+    _, counts = np.unique(link, return_counts=True)
+    # A window costs as much as 64 splats in it. Other sizes than multiples of 16 are slow.
+    cluster = min(range(16, 129, 16), key=lambda c: np.sum(-(-counts // c)) * (c + 64))
+    groups = [
+        group
+        for value in np.unique(link)
+        for group in _halve(np.flatnonzero(link == value), mean, cluster)
+    ]
+    order = np.concatenate([np.resize(group, cluster) for group in groups])
+    spare = np.concatenate([np.arange(cluster) >= len(group) for group in groups])
+    clustered = jax.tree.map(lambda a: a[order] if a.ndim else a, model)
+    clustered = dataclasses.replace(clustered, density=jnp.where(spare, 0.0, clustered.density))
+    size = (camera.height, camera.width)
+
+    @jax.jit
+    @jax.vmap
+    def needed(poses):
+        low, high = _extents(*_project(clustered, poses, camera), model.tau, cluster, size)
+        return jnp.max(high - low, axis=0)
+
+    px = int(8 * np.ceil(np.quantile(needed(poses), 0.95) / 8))
+    if px > 5 * min(size) // 8:
+        return model, None
+    return clustered, Windows(cluster=cluster, px=px)
+
+
+def _halve(members: np.ndarray, mean: np.ndarray, most: int) -> list[np.ndarray]:
+    """Cut splats across their longest side until no part has more than ``most``."""
+    parts = -(-len(members) // most)
+    if parts == 1:
+        return [members]
+    axis = np.argmax(np.ptp(mean[members], axis=0))
+    members = members[np.argsort(mean[members, axis], kind="stable")]
+    cut = len(members) * (parts // 2) // parts
+    return _halve(members[:cut], mean, most) + _halve(members[cut:], mean, most)
