@@ -11,6 +11,7 @@ import numpy as np
 
 from vrrt_jax import checks
 from vrrt_jax.core import tree as trees
+from vrrt_jax.core.kinematics import link_poses
 from vrrt_jax.core.rrt import RRT, RRTConnect, connection_path, tree_path
 from vrrt_jax.core.search import SearchResult, Stopped, make_stop, search
 from vrrt_jax.core.shortcut import path_length, shortcut
@@ -20,7 +21,8 @@ from vrrt_jax.core.world import World, obstacle_list
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.splat.goal import prepare_goal
 from vrrt_jax.splat.model import SelfModel
-from vrrt_jax.splat.types import Camera
+from vrrt_jax.splat.raster import Windows, choose_windows
+from vrrt_jax.splat.types import Camera, SplatModel
 from vrrt_jax.visual import Probing, VisualPolicy, plant
 
 STATUS_OF = {
@@ -342,8 +344,10 @@ def visual_policy(
         "anneal_loss": config.anneal * goal_loss,
         "rewire_radius": config.rewire_radius,
     }
+    splats, windows = _windowed(robot, level.splats, cameras)
     policy = VisualPolicy(
-        splats=level.splats,
+        splats=splats,
+        windows=windows,
         cameras=cameras,
         goal=goal,
         **{name: jnp.float32(value) for name, value in numbers.items()},
@@ -351,10 +355,13 @@ def visual_policy(
         lanes=config.lanes,
     )
     coarse_goal, coarse_cameras = prepare_goal(goal_image, camera, config.probe_px)
+    level = self_model.level_for(coarse_goal.coverage.shape[1])
+    splats, windows = _windowed(robot, level.splats, coarse_cameras)
     coarse = dataclasses.replace(
         policy,
         alpha=jnp.float32(config.probe_alpha),
-        splats=self_model.level_for(coarse_goal.coverage.shape[1]).splats,
+        splats=splats,
+        windows=windows,
         cameras=coarse_cameras,
         goal=coarse_goal,
     )
@@ -368,6 +375,23 @@ def visual_policy(
     return policy, probing, goal_loss
 
 
+def _windowed(
+    robot: Robot, splats: SplatModel, cameras: Camera
+) -> tuple[SplatModel, Windows | None]:
+    """The splats in clusters, with windows of the image that hold most of them in every view."""
+    rng = np.random.default_rng(0)
+    q = jnp.asarray(rng.uniform(robot.lower, robot.upper, (64, robot.num_joints)), jnp.float32)
+    poses = _poses(robot.chain, q)
+    found = [
+        choose_windows(splats, poses, jax.tree.map(lambda leaf: leaf[view], cameras))  # noqa: B023
+        for view in range(len(cameras.focal))
+    ]
+    if any(windows is None for _, windows in found):
+        return splats, None
+    return max(found, key=lambda pair: pair[1].px)
+
+
+_poses = jax.jit(jax.vmap(link_poses, (None, 0)))
 _plant = jax.jit(plant, static_argnums=5)
 
 

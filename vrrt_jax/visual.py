@@ -17,7 +17,8 @@ from vrrt_jax.core.rrt import sample_configurations
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
 from vrrt_jax.core.world import World, is_free
 from vrrt_jax.splat.loss import goal_loss
-from vrrt_jax.splat.raster import map_lanes
+from vrrt_jax.splat.raster import Windows, map_lanes
+
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
 
 
@@ -38,6 +39,7 @@ class VisualPolicy:
     """
 
     splats: SplatModel
+    windows: Windows | None  # how the rasterizer cuts its work, for these splats
     cameras: Camera  # leading axis V
     goal: GoalImage
     alpha: jax.Array  # () Adam step [rad]
@@ -56,7 +58,7 @@ class VisualPolicy:
 
     def loss(self, world: World, q: jax.Array) -> jax.Array:
         """Image loss () of a configuration (D,)."""
-        return goal_loss(world.chain, self.splats, self.cameras, self.goal, q)
+        return goal_loss(world.chain, self.splats, self.cameras, self.goal, q, self.windows)
 
     def roots(self, world: World, q: jax.Array) -> tuple[jax.Array, VisualNode]:
         """Losses (R,) and payloads of roots ``q`` (R, D)."""

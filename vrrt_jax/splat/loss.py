@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from vrrt_jax.core.kinematics import Chain, link_poses
-from vrrt_jax.splat.raster import render
+from vrrt_jax.splat.raster import Windows, render
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
 
 
@@ -21,14 +21,19 @@ def image_loss(
 
 
 def goal_loss(
-    chain: Chain, splats: SplatModel, cameras: Camera, goal: GoalImage, q: jax.Array
+    chain: Chain,
+    splats: SplatModel,
+    cameras: Camera,
+    goal: GoalImage,
+    q: jax.Array,
+    windows: Windows | None = None,
 ) -> jax.Array:
     """Loss () of a configuration (D,): the mean over the V views."""
     poses = link_poses(chain, q)
     losses = []
     for view in range(goal.rgb.shape[0]):
         camera = jax.tree.map(lambda leaf: leaf[view], cameras)  # noqa: B023 - used at once
-        rgb, coverage = render(splats, poses, camera)
+        rgb, coverage = render(splats, poses, camera, windows)
         losses.append(
             image_loss(rgb, coverage, goal.rgb[view], goal.coverage[view], goal.valid[view])
         )
