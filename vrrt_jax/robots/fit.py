@@ -54,6 +54,7 @@ def fit_spheres(
     pieces = collision_pieces(model)
     samples = cover.sample_bodies(model, pieces, rng)
     moving = [body for body in pieces if model.body_weldid[body]]
+    progress(f"fitting {num_spheres} spheres to {len(moving)} moving bodies")
     fitted = _share_out({body: samples[body] for body in moving}, num_spheres, rng, progress)
     for body in pieces:
         if body not in moving:
