@@ -49,6 +49,12 @@ def arm(tmp_path_factory):
     return load_robot(path)
 
 
+def true_model(robot):
+    spec = sources.mesh_spec(robot, visuals=False)
+    assert spec is not None
+    return spec.compile()
+
+
 def uncovered(model, bodies, robot, rng):
     """Largest distance [m] of a surface point of the model from the robot's cover spheres."""
     found = spheres.spheres_of(mujoco.MjModel.from_xml_string(robot.xml)).cover
@@ -82,7 +88,7 @@ def test_panda_spheres_contain_the_whole_surface(panda, panda_meshes, rng):
 
 
 def test_spheres_fitted_on_loading_contain_the_geometry(arm, rng):
-    model = sources.mesh_spec(arm, visuals=False).compile()
+    model = true_model(arm)
     assert uncovered(model, [2, 3], arm, rng) <= 1e-9
     report = measure_spheres(arm, num=2000, seed=1)
     assert report.obstacles.misses == 0
@@ -104,7 +110,7 @@ def test_fit_spheres_writes_a_robot(arm, tmp_path, monkeypatch, rng):
     assert len(robot.cover_bodies) == 5
     assert sum(body == "base" for body in robot.thin_bodies) <= 2
     assert robot.mesh_source == arm.mesh_source
-    model = sources.mesh_spec(arm, visuals=False).compile()
+    model = true_model(arm)
     assert uncovered(model, [2, 3], robot, rng) <= 1e-9
     report = measure_spheres(robot, num=1000, seed=1)
     assert report.obstacles.misses == 0
