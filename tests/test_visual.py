@@ -24,7 +24,7 @@ from vrrt_jax.visual import plant
 Q_START = np.array([-0.9, 0.5, 0.0, -1.6, 0.0, 2.0, 0.8], np.float32)
 Q_GOAL = np.array([-0.5, 0.3, 0.2, -1.9, 0.1, 2.2, 0.6], np.float32)
 SMALL = planner.PlannerConfig(
-    lanes=8, capacity=1024, image_px=32, probes=64, probes_kept=7, max_iterations=150
+    lanes=8, capacity=1024, image_px=32, probes=64, probes_kept=8, max_iterations=150
 )
 
 

@@ -61,7 +61,7 @@ class PlannerConfig:
     probe_radius: float = 2.8  # how far from it [rad]
     probe_alpha: float = 0.06  # first of these steps, falling to zero [rad]
     probe_steps: int = 60  # Adam steps that the kept ones take at that resolution
-    probes_kept: int = 63  # best of them that become roots beside the start (re-compiles)
+    probes_kept: int = 64  # best of them, which take those steps and become roots (re-compiles)
     probe_px: int = 32  # image height that they are rendered at (re-compiles)
     rewiring: bool = True  # RRT*
     rewire_radius: float = 0.3  # [rad]

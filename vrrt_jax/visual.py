@@ -166,7 +166,7 @@ class Probing:
     radius: jax.Array  # () largest distance from the start [rad]
     steps: jax.Array  # () i32 Adam steps that each kept one takes
     num: int = static()  # configurations rendered; none gives the plain tree of the paper
-    kept: int = static()  # best of them that become roots
+    kept: int = static()  # best of them that descend; all but the last become roots
 
 
 def plant(
@@ -192,7 +192,8 @@ def plant(
     """
     q = q_start[None]
     if probing.num:
-        q = jnp.concatenate([q, _best_probes(world, probing, q_start, key)])
+        # One fewer than descended, so that lanes come out even and compile once.
+        q = jnp.concatenate([q, _best_probes(world, probing, q_start, key)[:-1]])
     score, payload = policy.roots(world, q)
     blocked = ~jax.vmap(is_free, (None, 0))(world, q)
     score = jnp.where(blocked, jnp.finfo(score.dtype).max, score)
