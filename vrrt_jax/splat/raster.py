@@ -271,9 +271,9 @@ def _over_pixels(a: jax.Array, b: jax.Array) -> jax.Array:
     for its part takes long to compile if there are many.
     """
     num = a.shape[-2]
-    if num > 64:
+    if num > 32:
         return (jnp.ones((1, num), a.dtype) @ (a * b))[..., 0, :]
-    return sum(a[..., i, :] * b[..., i, :] for i in range(num))
+    return functools.reduce(jnp.add, [a[..., i, :] * b[..., i, :] for i in range(num)])
 
 
 def _profiles(clusters: _Splats, corner: jax.Array, window: tuple[int, int]):
@@ -366,8 +366,8 @@ def choose_windows(
     """
     mean, link = np.asarray(model.mean), np.asarray(model.link)
     _, counts = np.unique(link, return_counts=True)
-    # A window costs as much as 64 splats in it. Other sizes than multiples of 16 are slow.
-    cluster = min(range(16, 129, 16), key=lambda c: np.sum(-(-counts // c)) * (c + 64))
+    # A window costs as much as 24 splats in it. Other sizes than multiples of 16 are slow.
+    cluster = min(range(16, 97, 16), key=lambda c: np.sum(-(-counts // c)) * (c + 24))
     groups = [
         group
         for value in np.unique(link)
@@ -379,16 +379,20 @@ def choose_windows(
     clustered = dataclasses.replace(clustered, density=jnp.where(spare, 0.0, clustered.density))
     size = (camera.height, camera.width)
 
-    @jax.jit
-    @jax.vmap
-    def needed(poses):
-        low, high = _extents(*_project(clustered, poses, camera), model.tau, cluster, size)
-        return jnp.max(high - low, axis=0)
-
-    px = int(8 * np.ceil(np.quantile(needed(poses), 0.95) / 8))
+    needed = _needed(clustered, poses, camera, cluster)
+    px = int(8 * np.ceil(np.quantile(needed, 0.95) / 8))
     if px > 5 * min(size) // 8:
         return model, None
     return clustered, Windows(cluster=cluster, px=px)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+@functools.partial(jax.vmap, in_axes=(None, 0, None, None))
+def _needed(model: SplatModel, poses: jax.Array, camera: Camera, cluster: int) -> jax.Array:
+    """Pixels (K,) that clusters reach over, in the longer direction."""
+    size = (camera.height, camera.width)
+    low, high = _extents(*_project(model, poses, camera), model.tau, cluster, size)
+    return jnp.max(high - low, axis=0)
 
 
 def _halve(members: np.ndarray, mean: np.ndarray, most: int) -> list[np.ndarray]:
