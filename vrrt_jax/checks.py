@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.kinematics import link_poses
+from vrrt_jax.core.kinematics import Chain, link_poses
 from vrrt_jax.core.verify import contacts
 from vrrt_jax.core.world import World, is_free, obstacle_list
 from vrrt_jax.robots.robot import Robot
@@ -117,16 +117,21 @@ def check_self_model(robot: Robot, self_model: SelfModel) -> None:
 
 def check_cameras(robot: Robot, splats: SplatModel, cameras: Camera, q: np.ndarray) -> None:
     """Raise a ValueError for a camera that has no part of the robot in its picture."""
-    poses = link_poses(robot.chain, jnp.asarray(q))[splats.link]
-    points = jnp.einsum("gij,gj->gi", poses[:, :3, :3], splats.mean) + poses[:, :3, 3]
     for view in range(len(cameras.focal)):
         camera = jax.tree.map(lambda leaf: leaf[view], cameras)  # noqa: B023 - used at once
-        pixel, depth = project(camera, points)
-        size = jnp.array([camera.width, camera.height])
-        inside = jnp.all((pixel > 0) & (pixel < size), axis=-1) & (depth > 0.05)
-        if not bool(jnp.any(inside)):
-            eye = -camera.world_to_cam[:3, :3].T @ camera.world_to_cam[:3, 3]
+        if not bool(_sees(robot.chain, splats, camera, jnp.asarray(q))):
+            pose = np.asarray(camera.world_to_cam)
+            eye = np.round(-pose[:3, :3].T @ pose[:3, 3], 2).tolist()
             raise ValueError(
-                f"camera {view} at {np.round(np.asarray(eye), 2).tolist()} does not see the robot; "
-                "check world_to_cam (x right, y down, z forward) and the focal length"
+                f"camera {view} at {eye} does not see the robot; check world_to_cam (x right, "
+                "y down, z forward) and the focal length"
             )
+
+
+@jax.jit
+def _sees(chain: Chain, splats: SplatModel, camera: Camera, q: jax.Array) -> jax.Array:
+    pose = link_poses(chain, q)[splats.link]
+    points = jnp.einsum("gij,gj->gi", pose[:, :3, :3], splats.mean) + pose[:, :3, 3]
+    pixel, depth = project(camera, points)
+    size = jnp.array([camera.width, camera.height])
+    return jnp.any(jnp.all((pixel > 0) & (pixel < size), axis=-1) & (depth > 0.05))

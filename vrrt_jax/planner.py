@@ -99,7 +99,7 @@ class PlanResult:
     rejected: Mapping[str, int]  # lanes lost, by reason
     iterations: int
     timing: Mapping[str, float]  # compile_s, search_s, shortcut_s, verify_s
-    history: np.ndarray  # (chunks, 4): iteration, seconds, best loss, nodes
+    history: np.ndarray  # (chunks + 1, 4): iteration, seconds, best loss, nodes
     tree: Tree
 
     @property
@@ -388,7 +388,7 @@ def _windowed(
     ]
     if any(windows is None for _, windows in found):
         return splats, None
-    return max(found, key=lambda pair: pair[1].px)
+    return max(found, key=lambda pair: pair[1].px if pair[1] is not None else 0)
 
 
 _poses = jax.jit(jax.vmap(link_poses, (None, 0)))

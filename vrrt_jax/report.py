@@ -62,7 +62,7 @@ def save_result(
     problem: Problem, result: PlanResult, config: PlannerConfig, seed: int, folder: Path
 ) -> None:
     """Write ``result.json`` and ``path.npz`` into a folder, each at once or not at all."""
-    arrays = {
+    arrays: dict[str, Any] = {
         "path": result.path,
         "raw_path": result.raw_path,
         "history": result.history,

@@ -18,7 +18,6 @@ from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
 from vrrt_jax.core.world import World, is_free
 from vrrt_jax.splat.loss import goal_loss
 from vrrt_jax.splat.raster import Windows, map_lanes
-
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
 
 
@@ -126,7 +125,7 @@ class VisualPolicy:
         adam = optax.scale_by_adam(b1=self.beta1, b2=self.beta2, eps=1e-8)
         direction, state = jax.vmap(adam.update)(node.grad, node.adam)
         shrink = jnp.sqrt(jnp.minimum(1.0, loss / jnp.maximum(self.anneal_loss, 1e-12)))
-        step = -self.alpha * shrink[:, None] * direction
+        step = -self.alpha * shrink[:, None] * jnp.asarray(direction)
         # Momentum into a limit would only hold the joint there.
         stuck = ~world.wraps & ((q + step < world.lower) | (q + step > world.upper))
         return step, state._replace(mu=jnp.where(stuck, 0.0, state.mu))

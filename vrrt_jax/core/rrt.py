@@ -93,11 +93,6 @@ class RRTConnect:
     lanes: int = static(default=32)
     edge_steps: int = static(default=32)
 
-    def root(self, world: World, q: jax.Array) -> tuple[jax.Array, ConnectNode]:
-        """Score and payload of a single root, the start's."""
-        node = ConnectNode(side=jnp.int32(0), fresh=jnp.bool_(True), meets=jnp.int32(-1))
-        return jnp.float32(jnp.inf), node
-
     def forest(self, q_start: jax.Array, q_goal: jax.Array, capacity: int) -> Tree[ConnectNode]:
         """The two trees before the first iteration."""
         ends = ConnectNode(

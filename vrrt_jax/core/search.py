@@ -59,7 +59,7 @@ class SearchResult:
 
     tree: Tree
     stopped: Stopped
-    history: np.ndarray  # (chunks, 4): iteration, seconds, best score, nodes
+    history: np.ndarray  # (chunks + 1, 4): iteration, seconds, best score, nodes
     compile_s: float
     search_s: float
 
@@ -169,21 +169,13 @@ def search(
     jax.block_until_ready(advance(state, stop, key, jnp.int32(0)))
     compile_s = time.perf_counter() - started
 
-    history: list[tuple[float, float, float, float]] = []
+    history = [_record(state, 0.0)]
     started = time.perf_counter()
     with _interruptible() as interrupted:
         while True:
             state = jax.block_until_ready(advance(state, stop, key, jnp.int32(CHUNK)))
             seconds = time.perf_counter() - started
-            grown = state.tree
-            history.append(
-                (
-                    float(jnp.max(grown.iteration)),
-                    seconds,
-                    float(jnp.max(jnp.min(grown.score, axis=-1))),
-                    float(jnp.max(grown.size)),
-                )
-            )
+            history.append(_record(state, seconds))
             if on_progress is not None:
                 on_progress(state, seconds)
             code = int(jnp.min(codes(state, stop)))
@@ -202,6 +194,13 @@ def search(
         compile_s=compile_s,
         search_s=time.perf_counter() - started,
     )
+
+
+def _record(state: SearchState, seconds: float) -> tuple[float, float, float, float]:
+    """A row of the history; of a batch, the problem that is furthest from its goal."""
+    tree = state.tree
+    best = np.asarray(tree.score).min(axis=-1).max()
+    return float(np.max(tree.iteration)), seconds, float(best), float(np.max(tree.size))
 
 
 @contextlib.contextmanager

@@ -97,5 +97,5 @@ def _round(world: World, path: _Path, key: jax.Array) -> _Path:
 
 def path_length(world: World, path: np.ndarray) -> float:
     """Length of a path (P, D) [rad]."""
-    path = jnp.asarray(path)
-    return float(jnp.sum(distance(world, path[:-1], path[1:])))
+    q = jnp.asarray(path)
+    return float(jnp.sum(distance(world, q[:-1], q[1:])))

@@ -124,10 +124,6 @@ class ExpansionPolicy(Protocol[Payload]):
         """S, the number of collision checks along an edge (static)."""
         ...
 
-    def root(self, world: Any, q: jax.Array) -> tuple[jax.Array, Payload]:
-        """Score () and payload of a root at ``q`` (D,)."""
-        ...
-
     def propose(self, world: Any, tree: Tree[Payload], key: jax.Array) -> Proposals:
         """Choose a parent and a target for each of the B lanes."""
         ...

@@ -8,6 +8,7 @@ import dataclasses
 import json
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -257,7 +258,7 @@ def initial_splats(points: np.ndarray, num_splats: int, seed: int) -> SplatModel
     for index, num in zip(links, quota, strict=True):
         own = points[points[:, 0] == index]
         own = own[rng.permutation(len(own))[: max(60 * num, 2000)]]
-        centre, label = kmeans2(own[:, 1:4], num, iter=8, minit="points", seed=rng)
+        centre, label = kmeans2(own[:, 1:4], num, iter=8, minit="points", rng=rng)
         apart = np.linalg.norm(own[:, 1:4] - centre[label], axis=1)
         for k in range(num):
             members = label == k
@@ -385,7 +386,7 @@ def validate(robot, splats: SplatModel, images: Images) -> tuple[np.ndarray, np.
 
 
 def _store(file: Path, change, state, steps: int) -> None:
-    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((change, state))]
+    leaves: list[Any] = [np.asarray(leaf) for leaf in jax.tree.leaves((change, state))]
     part = file.with_suffix(".part")
     with open(part, "wb") as handle:
         np.savez(handle, steps=steps, **{f"leaf_{i}": leaf for i, leaf in enumerate(leaves)})

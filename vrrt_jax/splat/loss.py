@@ -37,7 +37,7 @@ def goal_loss(
         losses.append(
             image_loss(rgb, coverage, goal.rgb[view], goal.coverage[view], goal.valid[view])
         )
-    return sum(losses) / len(losses)
+    return jnp.mean(jnp.stack(losses))
 
 
 def psnr_db(mean_squared_error: float) -> float:
