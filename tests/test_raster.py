@@ -13,10 +13,10 @@ from vrrt_jax.splat.camera import look_at, stack_cameras
 from vrrt_jax.splat.raster import Windows, choose_windows, map_lanes, render, splat_sum
 from vrrt_jax.splat.types import SplatModel
 
-FLOAT32_TOLERANCE = 2e-5  # of images; worst seen 5e-6
-WINDOW_TOLERANCE = 2e-3  # of images; a splat may lose 1e-3 outside its window
-DIFFERENCE_TOLERANCE = 1e-6  # relative, of float64 gradients; worst seen 1e-8
-COSINE, RELATIVE_L2 = 0.99999, 1e-3  # of float32 gradients; worst seen 1 - 1e-9 and 3e-5
+FLOAT32_TOLERANCE = 2e-5  # of images; worst seen 3e-6
+WINDOW_TOLERANCE = 2e-3  # of images; a splat may lose 1e-3 outside its window, worst seen 4e-6
+DIFFERENCE_TOLERANCE = 1e-6  # relative, of float64 gradients; worst seen 7e-8
+COSINE, RELATIVE_L2 = 1 - 1e-6, 1e-4  # of float32 gradients; worst seen 1 - 1e-7 and 7e-6
 
 
 def splats(mean, rgb=None, *, radius=0.02, density=2.0, tau=0.03, link=None):
@@ -154,9 +154,9 @@ def test_a_splat_behind_the_camera_changes_nothing():
 
 @pytest.mark.parametrize("windows", [None, Windows(cluster=1, px=24)])
 def test_far_splats_keep_their_colour(windows):
-    """Two metres behind the nearest, at the smallest tau: a weight of 1e-29."""
+    """Four metres behind the nearest, at the smallest tau: exp(-133) is zero in float32."""
     model = splats(
-        [[1.0, 0.25, 0.0], [3.0, -0.75, 0.0]], [[1, 0, 0], [0, 1, 0]], radius=(0.03, 0.09)
+        [[1.0, 0.25, 0.0], [5.0, -1.25, 0.0]], [[1, 0, 0], [0, 1, 0]], radius=(0.03, 0.15)
     )
     model = dataclasses.replace(model, shade=jnp.zeros((2, 3)))
 
@@ -218,7 +218,7 @@ def test_clusters_that_fit_and_others_mix(rng):
     np.testing.assert_allclose(cut_value, value, rtol=WINDOW_TOLERANCE)
     for half in (slice(16), slice(16, 32)):
         cosine, distance = agree(cut_gradient[half], gradient[half])
-        assert cosine > COSINE and distance < WINDOW_TOLERANCE
+        assert cosine > COSINE and distance < RELATIVE_L2
 
 
 def test_a_near_splat_tints_far_ones_outside_a_narrow_window_too():
