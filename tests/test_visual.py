@@ -24,7 +24,7 @@ from vrrt_jax.visual import plant
 Q_START = np.array([-0.9, 0.5, 0.0, -1.6, 0.0, 2.0, 0.8], np.float32)
 Q_GOAL = np.array([-0.5, 0.3, 0.2, -1.9, 0.1, 2.2, 0.6], np.float32)
 SMALL = planner.PlannerConfig(
-    lanes=8, capacity=1024, image_px=32, probes=64, probes_kept=8, max_iterations=150
+    lanes=8, capacity=1024, image_px=48, probes=64, probes_kept=8, max_iterations=150
 )
 
 
@@ -151,7 +151,8 @@ def test_costs_stay_right_under_rewiring(policy, open_world):
 
 
 def test_probes_are_free_near_and_look_alike(panda, self_model, camera, image, wall_world, free):
-    visual, probing, _ = planner.visual_policy(panda, self_model, camera, image, Q_START, SMALL)
+    config = dataclasses.replace(SMALL, probe_steps=0)
+    visual, probing, _ = planner.visual_policy(panda, self_model, camera, image, Q_START, config)
     q_start = jnp.asarray(Q_START)
     tree = jax.jit(plant, static_argnums=5)(
         wall_world, visual, probing, q_start, jax.random.key(0), 512

@@ -208,7 +208,9 @@ def _best_probes(world: World, probing: Probing, q_start: jax.Array, key: jax.Ar
     direction /= jnp.linalg.norm(direction, axis=1, keepdims=True)
     distance = probing.radius * jax.random.uniform(key_distance, (probing.num, 1))
     q = into_limits(world, q_start + distance * direction)
-    _, best = jax.lax.top_k(-map_lanes(lambda q: probing.policy.loss(world, q), q), probing.kept)
+    loss = map_lanes(lambda q: probing.policy.loss(world, q), q)
+    loss = jnp.where(jax.vmap(is_free, (None, 0))(world, q), loss, jnp.inf)
+    _, best = jax.lax.top_k(-loss, probing.kept)
     return _descend(world, probing, q[best])
 
 
