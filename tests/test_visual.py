@@ -24,7 +24,7 @@ from vrrt_jax.visual import plant
 Q_START = np.array([-0.9, 0.5, 0.0, -1.6, 0.0, 2.0, 0.8], np.float32)
 Q_GOAL = np.array([-0.5, 0.3, 0.2, -1.9, 0.1, 2.2, 0.6], np.float32)
 SMALL = planner.PlannerConfig(
-    lanes=8, capacity=1024, image_px=48, probes=64, probes_kept=8, max_iterations=150
+    lanes=8, capacity=4096, image_px=48, probes=64, probes_kept=8, max_iterations=150
 )
 
 
@@ -188,7 +188,7 @@ def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
             image,
             q_start,
             key=jax.random.key(0),
-            config=dataclasses.replace(SMALL, **changes),
+            config=planner.PlannerConfig(image_px=48, capacity=4096, **changes),
         )
 
     result = run()
@@ -208,6 +208,7 @@ def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
             for level in self_model.levels
         ),
     )
+    assert len(traces) == 1
     few = {"max_iterations": 4}
     run(world=moved, **few)
     run(image=picture(panda, self_model, camera, Q_GOAL + 0.1), **few)

@@ -417,6 +417,8 @@ def _finish_visual(
 ) -> PlanResult:
     """Choose where to end, and connect it to the start if its tree is not the start's."""
     score, q = np.asarray(found.tree.score), np.asarray(found.tree.q)
+    if score.min() > goal_loss:  # nothing matches: the best that a path leads to
+        score = np.where(np.asarray(found.tree.cost) < trees.UNREACHED, score, np.inf)
     for best in _hypotheses(score, q, q_start, goal_loss):
         path = tree_path(found.tree, best)
         if np.array_equal(path[0], q_start) or score[best] > goal_loss:

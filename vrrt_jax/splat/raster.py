@@ -271,7 +271,7 @@ def _over_pixels(a: jax.Array, b: jax.Array) -> jax.Array:
     for its part takes long to compile if there are many.
     """
     num = a.shape[-2]
-    if num > 32:
+    if num > 64:
         return (jnp.ones((1, num), a.dtype) @ (a * b))[..., 0, :]
     return functools.reduce(jnp.add, [a[..., i, :] * b[..., i, :] for i in range(num)])
 
