@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.edges import distance
 from vrrt_jax.core.types import Rejection, Tree
 from vrrt_jax.core.world import World
 
@@ -100,8 +99,13 @@ def occupied(tree: Tree) -> jax.Array:
 
 def distances(world: World, tree: Tree, q: jax.Array) -> jax.Array:
     """Distances (B, N) from configurations (B, D) to every node, +inf to empty slots [rad]."""
-    apart = distance(world, tree.q[None], q[:, None])
-    return jnp.where(occupied(tree), apart, jnp.inf)
+    # Joint by joint: XLA's CPU loops for a sum over the last, short axis are many times slower.
+    squared = jnp.zeros((q.shape[0], tree.capacity), q.dtype)
+    for joint in range(q.shape[1]):
+        step = tree.q[:, joint] - q[:, joint, None]
+        turns = jnp.where(world.wraps[joint], jnp.round(step / (2 * jnp.pi)), 0.0)
+        squared += (step - 2 * jnp.pi * turns) ** 2
+    return jnp.where(occupied(tree), jnp.sqrt(squared), jnp.inf)
 
 
 def lineage(tree: Tree, index: int) -> np.ndarray:
