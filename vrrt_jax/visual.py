@@ -20,6 +20,8 @@ from vrrt_jax.splat.loss import goal_loss
 from vrrt_jax.splat.raster import Windows, map_lanes
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
 
+MAX_RANK = 1024  # best nodes that the frontier's law ranks; its weight there is below 1e-40
+
 
 @pytree
 class VisualNode:
@@ -54,6 +56,7 @@ class VisualPolicy:
     lanes: int = static(default=32)
     edge_steps: int = static(default=6)
     rewire_steps: int = static(default=15)
+    rewire_checks: int = static(default=8)
 
     def loss(self, world: World, q: jax.Array) -> jax.Array:
         """Image loss () of a configuration (D,)."""
@@ -74,19 +77,20 @@ class VisualPolicy:
         ``eta (1 - kappa) kappa^k / (1 - kappa^M) + (1 - eta) / M``, drawn without replacement by
         Gumbel top-k. Exploiting lanes rank and draw only nodes not exploited before, since a second
         step from the same gradient would repeat the first; where those run out, lanes explore.
+        The law ends at rank :data:`MAX_RANK`, as finding ranks costs more than all the rest.
         """
         key_exploit, key_explore, key_q = jax.random.split(key, 3)
-        order = jnp.argsort(tree.score)
-        filled = jnp.arange(tree.capacity) < tree.size
-        unexploited = filled & ~tree.payload.exploited[order]
-        exploit_parent, has_step = self._draw(unexploited, key_exploit)
-        explore_parent, has_parent = self._draw(filled, key_explore)
+        filled = trees.occupied(tree)
+        exploit_parent, has_step = self._draw(
+            tree.score, filled & ~tree.payload.exploited, key_exploit
+        )
+        explore_parent, has_parent = self._draw(tree.score, filled, key_explore)
 
         exploits = has_step & (
             jnp.arange(self.lanes) < jnp.round((1.0 - self.exploration) * self.lanes)
         )
         spare = jnp.where(has_parent, explore_parent, explore_parent[0])
-        parent = order[jnp.where(exploits, exploit_parent, spare)].astype(jnp.int32)
+        parent = jnp.where(exploits, exploit_parent, spare).astype(jnp.int32)
         q = tree.q[parent]
         node = jax.tree.map(lambda leaf: leaf[parent], tree.payload)
         step, adam = self._adam_step(world, q, tree.score[parent], node)
@@ -109,16 +113,21 @@ class VisualPolicy:
             ),
         )
 
-    def _draw(self, allowed: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Places (B,) in the loss order, of nodes that are allowed (N,), and whether there are."""
-        rank = jnp.cumsum(allowed) - 1
-        total = jnp.maximum(jnp.sum(allowed), 1)
-        decay = (1.0 - self.kappa) * self.kappa**rank / (1.0 - self.kappa**total)
-        weight = self.eta * decay + (1.0 - self.eta) / total
-        noise = jax.random.gumbel(key, allowed.shape)
+    def _draw(
+        self, score: jax.Array, allowed: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Nodes (B,) among those that are allowed (N,), and whether there were as many."""
+        total = jnp.sum(allowed)
+        ranked = jnp.minimum(total, MAX_RANK)
+        rank = jnp.arange(min(MAX_RANK, len(score)))
+        decay = (1.0 - self.kappa) * self.kappa**rank / (1.0 - self.kappa**ranked)
+        _, best = jax.lax.top_k(jnp.where(allowed, -score, -jnp.inf), len(rank))
+        weight = jnp.full(score.shape, (1.0 - self.eta) / total)
+        weight = weight.at[best].add(self.eta * decay)
+        noise = jax.random.gumbel(key, score.shape)
         logit = jnp.where(allowed, jnp.log(weight + 1e-30) + noise, -jnp.inf)
-        best, place = jax.lax.top_k(logit, self.lanes)
-        return place, best > -jnp.inf
+        logit, node = jax.lax.top_k(logit, self.lanes)
+        return node, logit > -jnp.inf
 
     def _adam_step(self, world: World, q: jax.Array, loss: jax.Array, node: VisualNode):
         """Steps (B, D) down the image loss, and the moments after them."""
@@ -153,7 +162,12 @@ class VisualPolicy:
         if not self.rewiring:
             return tree
         return rewire(
-            world, tree, expansion, radius=self.rewire_radius, edge_steps=self.rewire_steps
+            world,
+            tree,
+            expansion,
+            radius=self.rewire_radius,
+            edge_steps=self.rewire_steps,
+            checks=self.rewire_checks,
         )
 
 

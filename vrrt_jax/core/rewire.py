@@ -2,8 +2,7 @@
 
 A batch is rewired at once, on the costs before it: a parent is adopted only if that makes a node
 strictly cheaper, and costs grow along every branch, so no two adoptions can close a cycle. In a
-forest
-this also joins trees: their roots, but for the first, may be adopted like any node.
+forest this also joins trees: their roots, but for the first, may be adopted like any node.
 """
 
 import dataclasses
@@ -28,11 +27,13 @@ def rewire(
     *,
     radius: jax.Array,
     edge_steps: int,
+    checks: int,
 ) -> Tree[Payload]:
     """Rewire a tree around the nodes that an iteration inserted.
 
-    For every new node the edge from its best possible parent and the edge to the node that would
-    gain most from it are checked; one edge each keeps the cost of an iteration bounded.
+    Every new node may ask for the edge from its best possible parent, and then for the edge to the
+    node that would gain most from it. Of either kind, the ``checks`` that save most are checked for
+    collision, which bounds the cost of an iteration.
 
     Args:
         world: robot and obstacles.
@@ -40,6 +41,7 @@ def rewire(
         expansion: the new nodes.
         radius: of the neighbourhood [rad]; no more than ``edge_steps`` times the resolution.
         edge_steps: sub-steps of an edge check (static).
+        checks: edges of either kind that are checked (static).
 
     Returns:
         The tree with new parents, and costs that are right for all nodes.
@@ -52,11 +54,11 @@ def rewire(
 
     via = jnp.where(near, tree.cost + apart, jnp.inf)
     best, cost_via = jnp.argmin(via, axis=1), jnp.min(via, axis=1)
-    better = cost_via < tree.cost[new] - GAIN
-    better &= _edge_is_free(world, tree.q[best], expansion.q, edge_steps)
-    slot = jnp.where(better, expansion.slot, tree.capacity)
-    parent = tree.parent.at[slot].set(best.astype(jnp.int32), mode="drop")
-    cost = tree.cost.at[slot].set(cost_via, mode="drop")
+    lane, better = _largest(tree.cost[new] - cost_via, checks)
+    better &= _edge_is_free(world, tree.q[best[lane]], expansion.q[lane], edge_steps)
+    slot = jnp.where(better, expansion.slot[lane], tree.capacity)
+    parent = tree.parent.at[slot].set(best[lane].astype(jnp.int32), mode="drop")
+    cost = tree.cost.at[slot].set(cost_via[lane], mode="drop")
 
     through = jnp.where(near, cost[new][:, None] + apart, jnp.inf)
     is_main_root = jnp.arange(tree.capacity) == 0
@@ -66,14 +68,20 @@ def rewire(
     rival = (most[None] > most[:, None]) | (
         (most[None] == most[:, None]) & (jnp.arange(len(new)) < jnp.arange(len(new))[:, None])
     )
-    adopts = (most > GAIN) & ~jnp.any(same_child & rival, axis=1)
-    adopts &= _edge_is_free(world, expansion.q, tree.q[child], edge_steps)
-    parent = parent.at[jnp.where(adopts, child, tree.capacity)].set(
-        new.astype(jnp.int32), mode="drop"
+    lane, adopts = _largest(jnp.where(jnp.any(same_child & rival, axis=1), 0.0, most), checks)
+    adopts &= _edge_is_free(world, expansion.q[lane], tree.q[child[lane]], edge_steps)
+    parent = parent.at[jnp.where(adopts, child[lane], tree.capacity)].set(
+        new[lane].astype(jnp.int32), mode="drop"
     )
 
     tree = dataclasses.replace(tree, parent=parent, cost=cost)
     return jax.lax.cond(jnp.any(adopts), lambda t: with_costs(world, t), lambda t: t, tree)
+
+
+def _largest(gain: jax.Array, num: int) -> tuple[jax.Array, jax.Array]:
+    """Lanes (num,) that gain most, and whether that is more than nothing."""
+    gain, lane = jax.lax.top_k(gain, min(num, len(gain)))
+    return lane, gain > GAIN
 
 
 def with_costs(world: World, tree: Tree[Payload]) -> Tree[Payload]:

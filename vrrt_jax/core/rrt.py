@@ -68,7 +68,12 @@ class RRT:
         if not self.star:
             return tree
         return rewire(
-            world, tree, expansion, radius=self.rewire_radius, edge_steps=self.rewire_steps
+            world,
+            tree,
+            expansion,
+            radius=self.rewire_radius,
+            edge_steps=self.rewire_steps,
+            checks=self.lanes,
         )
 
 

@@ -114,8 +114,8 @@ def run_chunk(
     stop: Stop,
     key: jax.Array,
     num_iterations: jax.Array,
-) -> SearchState:
-    """Up to ``num_iterations`` iterations, fewer when a stopping rule holds."""
+) -> tuple[SearchState, jax.Array]:
+    """Up to ``num_iterations`` iterations, and the rule that holds then: :func:`why_stopped`."""
     last = state.tree.iteration + num_iterations
 
     def goes_on(state: SearchState) -> jax.Array:
@@ -132,7 +132,8 @@ def run_chunk(
             reference_iteration=jnp.where(improved, tree.iteration, state.reference_iteration),
         )
 
-    return jax.lax.while_loop(goes_on, iterate, state)
+    state = jax.lax.while_loop(goes_on, iterate, state)
+    return state, why_stopped(state, stop)
 
 
 _chunk = jax.jit(run_chunk)
@@ -164,7 +165,6 @@ def search(
     """
     state = (jax.vmap(initial_state) if batched else initial_state)(tree)
     advance = partial(_chunks if batched else _chunk, world, policy)
-    codes = jax.vmap(why_stopped) if batched else why_stopped
     started = time.perf_counter()
     jax.block_until_ready(advance(state, stop, key, jnp.int32(0)))
     compile_s = time.perf_counter() - started
@@ -173,12 +173,12 @@ def search(
     started = time.perf_counter()
     with _interruptible() as interrupted:
         while True:
-            state = jax.block_until_ready(advance(state, stop, key, jnp.int32(CHUNK)))
+            state, codes = jax.block_until_ready(advance(state, stop, key, jnp.int32(CHUNK)))
             seconds = time.perf_counter() - started
             history.append(_record(state, seconds))
             if on_progress is not None:
                 on_progress(state, seconds)
-            code = int(jnp.min(codes(state, stop)))
+            code = int(np.min(codes))
             if code >= 0:
                 break
             if interrupted.is_set():
@@ -198,8 +198,8 @@ def search(
 
 def _record(state: SearchState, seconds: float) -> tuple[float, float, float, float]:
     """A row of the history; of a batch, the problem that is furthest from its goal."""
-    tree = state.tree
-    best = np.asarray(tree.score).min(axis=-1).max()
+    tree = jax.device_get(state.tree)
+    best = tree.score.min(axis=-1).max()
     return float(np.max(tree.iteration)), seconds, float(best), float(np.max(tree.size))
 
 

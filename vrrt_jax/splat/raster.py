@@ -267,13 +267,12 @@ def _products_bar(clusters: _Splats, corner: jax.Array, sums_bar: jax.Array) -> 
 def _over_pixels(a: jax.Array, b: jax.Array) -> jax.Array:
     """Sum of a * b over the last axis but one.
 
-    XLA's CPU loops for the sum of a product are ten times slower than a chain of additions, which
-    for its part takes long to compile if there are many.
+    By halves, as XLA's CPU loops for the sum of a product are ten times slower than additions.
     """
-    num = a.shape[-2]
-    if num > 64:
-        return (jnp.ones((1, num), a.dtype) @ (a * b))[..., 0, :]
-    return functools.reduce(jnp.add, [a[..., i, :] * b[..., i, :] for i in range(num)])
+    total = a * b
+    while (num := total.shape[-2]) % 2 == 0:
+        total = total[..., : num // 2, :] + total[..., num // 2 :, :]
+    return functools.reduce(jnp.add, jnp.unstack(total, axis=-2))
 
 
 def _profiles(clusters: _Splats, corner: jax.Array, window: tuple[int, int]):
@@ -295,8 +294,9 @@ def _each_lane(on_cpu: Callable, elsewhere: Callable) -> Callable:
 
     @custom_vmap
     def lanes(*args):
-        in_turn = functools.partial(_in_turn, on_cpu)
-        return lax.platform_dependent(*args, cpu=in_turn, default=jax.vmap(elsewhere))
+        if jax.default_backend() == "cpu":
+            return _in_turn(on_cpu, *args)
+        return jax.vmap(elsewhere)(*args)
 
     @lanes.def_vmap
     def _merge(num, batched, *args):
