@@ -68,7 +68,7 @@ def policy(panda, self_model, camera, image):
 def grown(world, policy, iterations, **changes):
     policy, probing = policy
     policy = dataclasses.replace(policy, **changes)
-    tree = plant(world, policy, probing, jnp.asarray(Q_START), jax.random.key(1), 1024)
+    tree = plant(world, policy, probing, jnp.asarray(Q_START)[None], jax.random.key(1), 1024)
     step = jax.jit(expand)
     for _ in range(iterations):
         tree = step(world, policy, tree, jax.random.key(0))
@@ -81,11 +81,14 @@ def test_frontier_law(policy):
         visual = dataclasses.replace(
             visual, eta=jnp.float32(eta), kappa=jnp.float32(kappa), lanes=1
         )
-        allowed = jnp.arange(64) < m
+        order = jax.random.permutation(jax.random.key(1), 64)
+        score, allowed = jnp.argsort(order).astype(jnp.float32), jnp.zeros(64, bool)
+        allowed = allowed.at[order[:m]].set(True)
         keys = jax.random.split(jax.random.key(0), 20_000)
-        place, ok = jax.vmap(lambda key: visual._draw(allowed, key))(keys)  # noqa: B023
+        node, ok = jax.vmap(lambda key: visual._draw(score, allowed, key))(keys)  # noqa: B023
         assert bool(jnp.all(ok))
-        share = np.bincount(np.asarray(place[:, 0]), minlength=64) / len(keys)
+        rank = np.asarray(score, int)[np.asarray(node[:, 0])]
+        share = np.bincount(rank, minlength=64) / len(keys)
         k = np.arange(m)
         law = eta * (1 - kappa) * kappa**k / (1 - kappa**m) + (1 - eta) / m
         assert law.sum() == pytest.approx(1)
@@ -95,9 +98,9 @@ def test_frontier_law(policy):
 
 def test_draws_are_distinct_and_reported_when_they_run_out(policy):
     visual, _ = policy
-    place, ok = visual._draw(jnp.arange(64) < 5, jax.random.key(0))
+    node, ok = visual._draw(jnp.zeros(64), jnp.arange(64) < 5, jax.random.key(0))
     assert int(ok.sum()) == 5
-    assert sorted(np.asarray(place)[np.asarray(ok)]) == [0, 1, 2, 3, 4]
+    assert sorted(np.asarray(node)[np.asarray(ok)]) == [0, 1, 2, 3, 4]
 
 
 def test_a_branch_without_exploration_is_plain_adam(policy, open_world):
@@ -153,9 +156,9 @@ def test_costs_stay_right_under_rewiring(policy, open_world):
 def test_probes_are_free_near_and_look_alike(panda, self_model, camera, image, wall_world, free):
     config = dataclasses.replace(SMALL, probe_steps=0)
     visual, probing, _ = planner.visual_policy(panda, self_model, camera, image, Q_START, config)
-    q_start = jnp.asarray(Q_START)
+    q_roots = jnp.asarray(Q_START)[None]
     tree = jax.jit(plant, static_argnums=5)(
-        wall_world, visual, probing, q_start, jax.random.key(0), 512
+        wall_world, visual, probing, q_roots, jax.random.key(0), 512
     )
     roots = np.asarray(tree.q[1 : int(tree.size)])
     assert len(roots) == 7

@@ -6,6 +6,7 @@ from vrrt_jax.gl import choose_backend as _choose_backend
 
 _choose_backend()  # before anything imports MuJoCo
 
+from vrrt_jax.config import PlannerConfig, PlanResult  # noqa: E402
 from vrrt_jax.core.edges import difference, distance  # noqa: E402
 from vrrt_jax.core.kinematics import link_poses  # noqa: E402
 from vrrt_jax.core.types import Obstacle, Status  # noqa: E402
@@ -19,13 +20,7 @@ from vrrt_jax.core.world import (  # noqa: E402
     obstacle_list,
     with_obstacles,
 )
-from vrrt_jax.planner import (  # noqa: E402
-    PlannerConfig,
-    PlanResult,
-    plan,
-    plan_batch,
-    plan_to_configuration,
-)
+from vrrt_jax.planner import plan, plan_batch, plan_to_configuration  # noqa: E402
 from vrrt_jax.problems import Problem, load_problem, load_world, problem_names  # noqa: E402
 from vrrt_jax.robots import Robot, load_robot, robot_names  # noqa: E402
 from vrrt_jax.splat.camera import camera_from_matrix, look_at, orbit  # noqa: E402

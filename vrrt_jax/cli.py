@@ -1,4 +1,4 @@
-"""The ``vrrt`` command: plan, render, fit, spheres, bench."""
+"""The ``vrrt`` command: plan, render, fit, spheres, bench, report, worlds."""
 
 import argparse
 import json
@@ -67,11 +67,50 @@ def _parser() -> argparse.ArgumentParser:
     spheres.add_argument("--seed", type=int, default=0)
     spheres.add_argument("--num", type=int, default=10_000, help="configurations to measure on")
 
-    bench = commands.add_parser("bench", help="measure on this machine")
+    bench = commands.add_parser("bench", help="measure speed, success or settings")
     bench.set_defaults(run=_bench)
-    bench.add_argument("what", choices=("kinematics", "raster", "search"))
-    bench.add_argument("--json", help="write the figures here")
+    kinds = bench.add_subparsers(dest="what", required=True)
+    for what in ("kinematics", "raster", "search"):
+        speed = kinds.add_parser(what, help="how fast this machine is")
+        speed.add_argument("--json", help="write the figures here")
+    for what, words in (
+        ("visual", "the paper's tasks, among obstacles"),
+        ("pose", "recover the goal alone, without obstacles"),
+        ("ablation", "the paper's settings, varied one by one"),
+    ):
+        _add_protocol(kinds.add_parser(what, help=words), what)
+
+    report = commands.add_parser("report", help="tables and figures of benchmark results")
+    report.set_defaults(run=_report)
+    report.add_argument("files", nargs="+", help="JSON files that vrrt bench wrote")
+    report.add_argument("--out", required=True, help="folder for the page and its figures")
+
+    worlds = commands.add_parser("worlds", help="make random worlds around a robot")
+    worlds.set_defaults(run=_worlds)
+    _add_robot(worlds)
+    worlds.add_argument("--num", type=int, default=6)
+    worlds.add_argument("--seed", type=int, default=0)
+    worlds.add_argument("--out", required=True, help="folder for ROBOT_1.xml and so on")
     return parser
+
+
+def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
+    parser.add_argument("--robot", required=True, help="panda, ur5e or fetch")
+    parser.add_argument("--levels", default="0.5,1.0,1.5,2.0,2.5", help="distances [rad]")
+    parser.add_argument("--tasks-per-level", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    if what == "ablation":
+        parser.add_argument("--only", help="one setting, such as eta; all by default")
+    else:
+        parser.add_argument("--method", default="vrrt", help="vrrt, dr-robot, prof-robot, ...")
+        parser.add_argument("--config", default="default", help="default or paper")
+    parser.add_argument("--views", type=int, default=1, choices=(1, 2))
+    parser.add_argument("--azimuth", type=float, default=0.0, help="turn the cameras [degree]")
+    parser.add_argument("--light", type=float, default=1.0, help="brightness of the lamp")
+    parser.add_argument("--occluded", action="store_true", help="obstacles hide the robot")
+    parser.add_argument("--time-limit", type=float, default=60.0, help="of one search [s]")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--json", help="write results here; go on from what it holds")
 
 
 def _add_robot(parser: argparse.ArgumentParser, required: bool = True) -> None:
@@ -259,11 +298,58 @@ def _meshes(robot):
 def _bench(arguments: argparse.Namespace) -> int:
     import importlib
 
-    figures = importlib.import_module(f"vrrt_jax.bench.{arguments.what}").run()
-    text = json.dumps(figures, indent=2)
-    print(text)
-    if arguments.json:
-        Path(arguments.json).write_text(text + "\n")
+    if arguments.what not in ("visual", "pose", "ablation"):
+        figures = importlib.import_module(f"vrrt_jax.bench.{arguments.what}").run()
+        text = json.dumps(figures, indent=2)
+        print(text)
+        if arguments.json:
+            Path(arguments.json).write_text(text + "\n")
+        return EXIT_SOLVED
+
+    from vrrt_jax.bench import protocol, runner, tables
+    from vrrt_jax.bench.tasks import Scenery
+
+    if arguments.jobs < 1:
+        raise ValueError(f"--jobs is {arguments.jobs}; expected at least 1")
+    choices = ("method", "config", "only")
+    chosen = {name: getattr(arguments, name) for name in choices if hasattr(arguments, name)}
+    benchmark = protocol.benchmark(
+        arguments.what,
+        arguments.robot,
+        levels=[float(level) for level in _numbers(arguments.levels)],
+        tasks_per_level=arguments.tasks_per_level,
+        seed=arguments.seed,
+        time_limit_s=arguments.time_limit,
+        scenery=Scenery(
+            views=arguments.views,
+            azimuth_deg=arguments.azimuth,
+            light=arguments.light,
+            occluded=arguments.occluded,
+        ),
+        **chosen,
+    )
+    print(tables.to_text(runner.run(benchmark, arguments.json, jobs=arguments.jobs)))
+    return EXIT_SOLVED
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    from vrrt_jax.bench import tables
+
+    page = tables.write_page([Path(file) for file in arguments.files], _writable(arguments.out))
+    print(f"wrote {page}")
+    return EXIT_SOLVED
+
+
+def _worlds(arguments: argparse.Namespace) -> int:
+    from vrrt_jax.bench.worlds import random_world, write_world
+    from vrrt_jax.robots import load_robot
+
+    robot, out = load_robot(arguments.robot, freeze=arguments.freeze), _writable(arguments.out)
+    for k in range(1, arguments.num + 1):
+        seed = arguments.seed + k
+        comment = f"Written by the command `vrrt worlds --robot {robot.name}`, seed {seed}."
+        write_world(random_world(robot, seed), out / f"{robot.name}_{k}.xml", comment)
+    print(f"wrote {arguments.num} worlds to {out}")
     return EXIT_SOLVED
 
 

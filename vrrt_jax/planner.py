@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax import checks
+from vrrt_jax.config import PlannerConfig, PlanResult
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.kinematics import link_poses
+from vrrt_jax.core.kinematics import batch_link_poses
 from vrrt_jax.core.rrt import RRT, RRTConnect, connection_path, tree_path
 from vrrt_jax.core.search import SearchResult, Stopped, make_stop, search
 from vrrt_jax.core.shortcut import path_length, shortcut
-from vrrt_jax.core.types import Rejection, Status, Tree
-from vrrt_jax.core.verify import Verification, verify_path
+from vrrt_jax.core.types import Rejection, Status
+from vrrt_jax.core.verify import verify_path
 from vrrt_jax.core.world import World, obstacle_list
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.splat.goal import prepare_goal
@@ -41,87 +42,6 @@ SAME_LOSS = 1.05  # losses within this factor are the same match
 RRT_STAR_RADIUS = 1.9  # [rad] nodes of a sparse tree in seven dimensions lie that far apart
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PlannerConfig:
-    """Settings of Visual-RRT; all but the sizes are traced, so changing them never re-compiles.
-
-    The defaults are what measures best; :meth:`paper` has the published values.
-    """
-
-    alpha: float = 0.04  # Adam step [rad]
-    epsilon: float = 0.04  # exploration step [rad]
-    kappa: float = 0.9  # decay of the frontier's geometric law, in [0, 1)
-    eta: float = 0.7  # share of parents drawn by that law rather than uniformly, in [0, 1]
-    exploration: float = 0.3  # share r of lanes that explore, in [0, 1]
-    beta1: float = 0.9
-    beta2: float = 0.9
-    anneal: float = 10.0  # Adam steps shrink below this many times the match bar; 0 = never
-    match_scale: float = 1.0  # the goal loss, in units of the self-model's calibrated bar
-    probes: int = 1024  # renders around the start that seed the search (re-compiles)
-    probe_radius: float = 2.8  # how far from it [rad]
-    probe_alpha: float = 0.06  # first of these steps, falling to zero [rad]
-    probe_steps: int = 60  # Adam steps that the kept ones take at that resolution
-    probes_kept: int = 64  # best of them, which take those steps and become roots (re-compiles)
-    probe_px: int = 32  # image height that they are rendered at (re-compiles)
-    rewiring: bool = True  # RRT*
-    rewire_radius: float = 0.3  # [rad]
-    max_iterations: int = 400
-    settle: int = 12  # once matched, iterations without improvement until the search ends
-    patience: int | None = 100  # iterations without improvement after which it gives up
-    min_improvement: float = 0.0  # an improvement is a loss this much smaller ...
-    min_ratio: float = 0.97  # ... and below this share of the one before
-    time_limit_s: float = float("inf")  # of the search, compilation excluded [s]
-    connect_iterations: int = 200  # of RRT-Connect, to a match that the tree has not reached
-    shortcut_rounds: int = 60
-    verify_step: float = 0.005  # [rad]
-    lanes: int = 32  # expansions an iteration (re-compiles)
-    capacity: int = 8192  # nodes (re-compiles)
-    image_px: int = 64  # image height that is searched at (re-compiles)
-
-    @classmethod
-    def paper(cls, **changes: Any) -> "PlannerConfig":
-        """The published method (Visual-RRT, CVPR 2026): one tree, constant Adam steps."""
-        paper = {"probes": 0, "anneal": 0.0, "settle": 0, "min_improvement": 1e-4, "min_ratio": 1.0}
-        return cls(**{**paper, **changes})
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PlanResult:
-    """What became of a problem."""
-
-    status: Status
-    path: np.ndarray  # (P, D) the shortened, verified path; of a failure, the best attempt
-    raw_path: np.ndarray  # (P', D) as the tree has it
-    loss: float  # of the path's end: image loss, or distance to a joint goal [rad]
-    goal_loss: float  # at or below which it counts as matched
-    cost: float  # length of ``path`` [rad]
-    verification: Verification | None  # None if there was nothing to verify
-    rejected: Mapping[str, int]  # lanes lost, by reason
-    iterations: int
-    timing: Mapping[str, float]  # compile_s, search_s, shortcut_s, verify_s
-    history: np.ndarray  # (chunks + 1, 4): iteration, seconds, best loss, nodes
-    tree: Tree
-
-    @property
-    def ok(self) -> bool:
-        """Solved: matched, collision-free and verified."""
-        return self.status is Status.SOLVED
-
-    @property
-    def q_goal(self) -> np.ndarray:
-        """(D,) the end of the path."""
-        return self.path[-1]
-
-    def __str__(self) -> str:
-        """One line for people."""
-        times = ", ".join(f"{k.removesuffix('_s')} {v:.1f} s" for k, v in self.timing.items())
-        return (
-            f"{self.status.name}: loss {self.loss:.2e} (goal {self.goal_loss:.2e}), "
-            f"{len(self.path)} waypoints, {self.cost:.2f} rad, {self.iterations} iterations; "
-            f"{times}"
-        )
-
-
 def plan(
     robot: Robot,
     world: World,
@@ -132,6 +52,8 @@ def plan(
     *,
     key: jax.Array,
     config: PlannerConfig | None = None,
+    mask: np.ndarray | Sequence[np.ndarray] | None = None,
+    q_guess: np.ndarray | None = None,
     on_progress: Callable[..., Any] | None = None,
 ) -> PlanResult:
     """Find a collision-free path whose end looks like the goal image.
@@ -146,6 +68,9 @@ def plan(
         q_start: (D,) start configuration [rad] or [m].
         key: random key; the same key gives the same plan on the same machine, unless time ends it.
         config: settings, the default ones if None.
+        mask: (H, W) bool, True for the pixels of the goal image that are compared, where not all
+            are: something may hide the robot; or V of them.
+        q_guess: (D,) where the goal roughly is, if that is known: searched from too.
         on_progress: called with the search state and the seconds so far.
 
     Raises:
@@ -155,11 +80,18 @@ def plan(
     checks.check_config(config)
     q_start = checks.check_start(robot, world, q_start)
     policy, probing, goal_loss = visual_policy(
-        robot, self_model, camera, goal_image, q_start, config
+        robot, self_model, camera, goal_image, q_start, config, mask=mask
     )
-    seeds = (world, policy, probing, jnp.asarray(q_start), jax.random.fold_in(key, PLANTING))
-    _, compile_s = _timed(_plant, *seeds, config.capacity)
+    roots = q_start[None]
+    if q_guess is not None:
+        roots = np.stack([q_start, checks.check_limits(robot, q_guess, "guess")])
+    seeds = (world, policy, probing, jnp.asarray(roots), jax.random.fold_in(key, PLANTING))
+    programs = _plant._cache_size()
     tree, plant_s = _timed(_plant, *seeds, config.capacity)
+    compile_s = 0.0
+    if _plant._cache_size() > programs:
+        compile_s = plant_s
+        tree, plant_s = _timed(_plant, *seeds, config.capacity)
     found = search(
         world,
         policy,
@@ -230,7 +162,14 @@ def plan_batch(
     plants = jax.vmap(_plant, (None, 0, 0, 0, 0, None))
     seeds = jax.vmap(jax.random.fold_in, (0, None))(keys, PLANTING)
     tree = jax.block_until_ready(
-        plants(world, policies, probings, jnp.asarray(np.stack(starts)), seeds, config.capacity)
+        plants(
+            world,
+            policies,
+            probings,
+            jnp.asarray(np.stack(starts))[:, None],
+            seeds,
+            config.capacity,
+        )
     )
     compile_s = time.perf_counter() - started
     found = search(
@@ -313,7 +252,8 @@ def plan_to_configuration(
     )
     path = connection_path(found.tree) if planner == "rrt-connect" else tree_path(found.tree)
     loss = float(jnp.min(found.tree.score))
-    return _finish(robot, world, found, path, loss, max(stop_score, 1e-4), key, config, q_start)
+    goal_loss = max(stop_score, 1e-4)
+    return _finish(robot, world, found, path, q_goal, loss, goal_loss, key, config, q_start)
 
 
 def visual_policy(
@@ -323,12 +263,13 @@ def visual_policy(
     goal_image: Any,
     q_start: np.ndarray,
     config: PlannerConfig,
+    mask: Any = None,
 ) -> tuple[VisualPolicy, Probing, float]:
     """The policy, where to look before the search, and the loss that counts as matched."""
     checks.check_self_model(robot, self_model)
     if isinstance(camera, Camera):
-        camera, goal_image = [camera], [goal_image]
-    goal, cameras = prepare_goal(goal_image, camera, config.image_px)
+        camera, goal_image, mask = [camera], [goal_image], None if mask is None else [mask]
+    goal, cameras = prepare_goal(goal_image, camera, config.image_px, mask)
     level = self_model.level_for(goal.coverage.shape[1])
     checks.check_cameras(robot, level.splats, cameras, q_start)
     covered = float(jnp.sum(goal.valid * goal.coverage) / jnp.sum(goal.valid))
@@ -351,10 +292,11 @@ def visual_policy(
         cameras=cameras,
         goal=goal,
         **{name: jnp.float32(value) for name, value in numbers.items()},
+        inherit=jnp.asarray(config.inherit),
         rewiring=config.rewiring,
         lanes=config.lanes,
     )
-    coarse_goal, coarse_cameras = prepare_goal(goal_image, camera, config.probe_px)
+    coarse_goal, coarse_cameras = prepare_goal(goal_image, camera, config.probe_px, mask)
     level = self_model.level_for(coarse_goal.coverage.shape[1])
     splats, windows = _windowed(robot, level.splats, coarse_cameras)
     coarse = dataclasses.replace(
@@ -381,7 +323,7 @@ def _windowed(
     """The splats in clusters, with windows of the image that hold most of them in every view."""
     rng = np.random.default_rng(0)
     q = jnp.asarray(rng.uniform(robot.lower, robot.upper, (64, robot.num_joints)), jnp.float32)
-    poses = _poses(robot.chain, q)
+    poses = batch_link_poses(robot.chain, q)
     found = [
         choose_windows(splats, poses, jax.tree.map(lambda leaf: leaf[view], cameras))  # noqa: B023
         for view in range(len(cameras.focal))
@@ -391,7 +333,6 @@ def _windowed(
     return max(found, key=lambda pair: pair[1].px if pair[1] is not None else 0)
 
 
-_poses = jax.jit(jax.vmap(link_poses, (None, 0)))
 _plant = jax.jit(plant, static_argnums=5)
 
 
@@ -419,7 +360,7 @@ def _finish_visual(
     score, q = np.asarray(found.tree.score), np.asarray(found.tree.q)
     if score.min() > goal_loss:  # nothing matches: the best that a path leads to
         score = np.where(np.asarray(found.tree.cost) < trees.UNREACHED, score, np.inf)
-    for best in _hypotheses(score, q, q_start, goal_loss):
+    for best in _hypotheses(world, score, q, q_start, goal_loss):
         path = tree_path(found.tree, best)
         if np.array_equal(path[0], q_start) or score[best] > goal_loss:
             break
@@ -434,22 +375,29 @@ def _finish_visual(
             break
     else:
         best, path = int(np.argmin(score)), None
-    return _finish(robot, world, found, path, float(score[best]), goal_loss, key, config, q_start)
+    target, loss = q[best], float(score[best])
+    return _finish(robot, world, found, path, target, loss, goal_loss, key, config, q_start)
 
 
 def _hypotheses(
-    score: np.ndarray, q: np.ndarray, q_start: np.ndarray, goal_loss: float
+    world: World, score: np.ndarray, q: np.ndarray, q_start: np.ndarray, goal_loss: float
 ) -> Iterator[int]:
     """Nodes to end at: as good as the best, nearest to the start first; then other matches."""
+    wraps = np.asarray(world.wraps)
+
+    def apart(nodes: np.ndarray, q_other: np.ndarray) -> np.ndarray:
+        step = q[nodes] - q_other
+        return np.linalg.norm(step - 2 * np.pi * np.round(step / (2 * np.pi)) * wraps, axis=1)
+
     open_nodes = np.flatnonzero(score <= max(goal_loss, score.min()))
     for _ in range(HYPOTHESES):
         if len(open_nodes) == 0:
             return
         # Nodes just under the bar would be nearer still, but only as they are not there yet.
         equal = open_nodes[score[open_nodes] <= SAME_LOSS * score[open_nodes].min()]
-        best = int(equal[np.argmin(np.linalg.norm(q[equal] - q_start, axis=1))])
+        best = int(equal[np.argmin(apart(equal, q_start))])
         yield best
-        open_nodes = open_nodes[np.linalg.norm(q[open_nodes] - q[best], axis=1) > DISTINCT]
+        open_nodes = open_nodes[apart(open_nodes, q[best]) > DISTINCT]
 
 
 def _connect(
@@ -466,6 +414,7 @@ def _finish(
     world: World,
     found: SearchResult,
     raw_path: np.ndarray | None,
+    target: np.ndarray,
     loss: float,
     goal_loss: float,
     key: jax.Array,
@@ -503,6 +452,7 @@ def _finish(
         status=status,
         path=path,
         raw_path=raw_path,
+        target=target,
         loss=loss,
         goal_loss=goal_loss,
         cost=path_length(world, path),

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 import vrrt_jax
-from vrrt_jax.planner import PlannerConfig, PlanResult
+from vrrt_jax.config import PlannerConfig, PlanResult
 from vrrt_jax.problems import Problem
 
 

@@ -50,6 +50,7 @@ class VisualPolicy:
     exploration: jax.Array  # () share r of lanes that explore
     beta1: jax.Array  # ()
     beta2: jax.Array  # ()
+    inherit: jax.Array  # () bool, children go on with their parents' moments
     anneal_loss: jax.Array  # () loss under which Adam steps shrink with its square root; 0 = never
     rewire_radius: jax.Array  # () [rad]
     rewiring: bool = static(default=True)
@@ -93,6 +94,8 @@ class VisualPolicy:
         parent = jnp.where(exploits, exploit_parent, spare).astype(jnp.int32)
         q = tree.q[parent]
         node = jax.tree.map(lambda leaf: leaf[parent], tree.payload)
+        kept = jax.tree.map(lambda leaf: jnp.where(self.inherit, leaf, 0), node.adam)
+        node = dataclasses.replace(node, adam=kept)
         step, adam = self._adam_step(world, q, tree.score[parent], node)
 
         towards = difference(world, q, sample_configurations(world, key_q, self.lanes))
@@ -186,27 +189,27 @@ def plant(
     world: World,
     policy: VisualPolicy,
     probing: Probing,
-    q_start: jax.Array,
+    q_roots: jax.Array,
     key: jax.Array,
     capacity: int,
 ) -> Tree[VisualNode]:
     """A forest before the search: the start, and the probes that look most like the goal.
 
-    A probe's root has the cost :data:`~vrrt_jax.core.tree.UNREACHED`, until rewiring finds a way to
-    it from the start's tree.
+    All roots but the start have the cost :data:`~vrrt_jax.core.tree.UNREACHED`, until rewiring
+    finds a way to them from the start's tree.
 
     Args:
         world: robot and obstacles.
         policy: of the search.
         probing: where to look.
-        q_start: (D,).
+        q_roots: (R, D) the start, and other configurations to search from.
         key: random key.
         capacity: slots of the tree.
     """
-    q = q_start[None]
+    q = q_roots
     if probing.num:
-        # One fewer than descended, so that lanes come out even and compile once.
-        q = jnp.concatenate([q, _best_probes(world, probing, q_start, key)[:-1]])
+        # As many in all as descended, so that lanes come out even and compile once.
+        q = jnp.concatenate([q, _best_probes(world, probing, q_roots[0], key)[: -len(q_roots)]])
     score, payload = policy.roots(world, q)
     blocked = ~jax.vmap(is_free, (None, 0))(world, q)
     score = jnp.where(blocked, jnp.finfo(score.dtype).max, score)

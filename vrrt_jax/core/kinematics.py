@@ -57,6 +57,9 @@ def link_poses(chain: Chain, q: jax.Array) -> jax.Array:
     return jnp.stack(poses)
 
 
+batch_link_poses = jax.jit(jax.vmap(link_poses, (None, 0)))  # of q (n, D), for the host
+
+
 def _product(a: jax.Array, b: jax.Array) -> jax.Array:
     product = sum(a[:, k : k + 1] * b[k : k + 1] for k in range(4))
     return jax.lax.optimization_barrier(product)

@@ -10,7 +10,7 @@ import numpy as np
 from vrrt_jax.core.types import Obstacle
 from vrrt_jax.robots import text
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.robots.sources import mesh_spec
+from vrrt_jax.robots.sources import install_hint, mesh_spec
 
 _KINDS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -116,8 +116,7 @@ def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> Exac
     if spec is None and geometry == "meshes":
         raise ValueError(
             f"the meshes of robot '{robot.name}' are not on this machine: pip install "
-            "mujoco-menagerie, or point MENAGERIE_ROOT at a checkout of MuJoCo Menagerie, or use "
-            "geometry='spheres'"
+            f"{install_hint(robot.mesh_source)}, or use geometry='spheres'"
         )
     has_meshes = spec is not None
     spheres = mujoco.MjSpec.from_string(robot.xml)

@@ -9,7 +9,7 @@ from vrrt_jax.robots import cover, text, thin
 from vrrt_jax.robots.pairs import allowed_pairs, sample_self_collisions
 from vrrt_jax.robots.pieces import collision_pieces, contain_surface
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.robots.sources import mesh_spec
+from vrrt_jax.robots.sources import install_hint, mesh_spec
 
 _CONFIGURATIONS = 100_000  # for self-collision
 _LEAF = 3e-4  # [m]
@@ -47,7 +47,7 @@ def fit_spheres(
     if spec is None:
         raise ValueError(
             f"cannot fit spheres: the meshes of robot '{robot.name}' are not on this machine: pip "
-            "install mujoco-menagerie, or point MENAGERIE_ROOT at a checkout of MuJoCo Menagerie"
+            f"install {install_hint(robot.mesh_source)}"
         )
     model = spec.compile()
     rng = np.random.default_rng(seed)

@@ -62,6 +62,24 @@ def _unreadable(path: Path | str, error: Exception) -> str:
     )
 
 
+def keep_body(spec: mujoco.MjSpec, name: str) -> None:
+    """Put one child of the world at its origin and delete everything else, in place."""
+    for element in [*spec.worldbody.geoms, *spec.worldbody.bodies]:
+        if element.name != name:
+            spec.delete(element)
+    body = spec.body(name)
+    body.pos, body.quat = [0, 0, 0], [1, 0, 0, 0]
+
+
+def collide_visuals(spec: mujoco.MjSpec) -> None:
+    """Let the visual meshes collide, each as its convex hull, and delete all other geoms."""
+    for geom in list(spec.geoms):
+        if geom.type == mujoco.mjtGeom.mjGEOM_MESH and not (geom.contype or geom.conaffinity):
+            geom.contype = geom.conaffinity = 1
+        else:
+            spec.delete(geom)
+
+
 def strip_spec(spec: mujoco.MjSpec, *, visuals: bool) -> None:
     """Delete, in place, everything but bodies, joints, keys and geoms.
 
@@ -80,6 +98,7 @@ def strip_spec(spec: mujoco.MjSpec, *, visuals: bool) -> None:
     for key in spec.keys:  # sized for the actuators that are gone
         key.ctrl, key.act = [], []
     for geom in list(spec.geoms):
+        geom.margin = geom.gap = 0.0
         # a floor or a height field is the world's, and neither can be covered with spheres
         is_ground = geom.type in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
         if is_ground or (not visuals and not (geom.contype or geom.conaffinity)):

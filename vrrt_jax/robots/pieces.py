@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 STEP = 1e-4  # [m] centres and radii of fitted spheres are multiples of this
+_BLOCK = 10_000_000  # numbers in memory at once
 _ROUND = 20  # sides of the prism around a cylinder, 1.2 % wider; 2.5 % for other round shapes
 
 
@@ -21,7 +22,10 @@ class Piece:
 
     def depth(self, points: np.ndarray) -> np.ndarray:
         """Distance (n,) from points (n, 3) inside to the surface [m]; negative outside."""
-        return np.min(self.offsets - points @ self.normals.T, axis=1)
+        blocks = np.array_split(points, 1 + points.shape[0] * len(self.offsets) // _BLOCK)
+        return np.concatenate(
+            [np.min(self.offsets - block @ self.normals.T, axis=1) for block in blocks]
+        )
 
 
 def piece_of(points: np.ndarray) -> Piece:

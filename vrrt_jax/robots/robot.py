@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from vrrt_jax.core.kinematics import Chain, chain_from_model
+from vrrt_jax.core.kinematics import Chain, batch_link_poses, chain_from_model
 from vrrt_jax.core.types import Spheres
 from vrrt_jax.robots import mjcf, pairs, spheres, text, thin
 from vrrt_jax.robots.paths import robot_names, robot_path
@@ -91,6 +91,20 @@ def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None =
     return _robot(
         model=mujoco.MjModel.from_xml_string(xml), allowed=tuple(allowed), xml=xml, **fields
     )
+
+
+def workspace(robot: Robot) -> tuple[np.ndarray, float]:
+    """Centre (3,) and radius [m] of what the robot fills in random configurations."""
+    rng = np.random.default_rng(0)
+    q = rng.uniform(robot.lower, robot.upper, (500, robot.num_joints))
+    poses = np.asarray(batch_link_poses(robot.chain, jnp.asarray(q, jnp.float32)), np.float64)
+    points = []
+    for spheres_of_kind in (robot.cover, robot.thin):
+        pose = poses[:, np.asarray(spheres_of_kind.link)]
+        turned = np.einsum("nkij,kj->nki", pose[..., :3, :3], spheres_of_kind.centre)
+        points.append(turned + pose[..., :3, 3])
+    low, high = np.quantile(np.concatenate(points, axis=1).reshape(-1, 3), [0.01, 0.99], axis=0)
+    return (low + high) / 2, float(np.linalg.norm(high - low) / 2)
 
 
 def _reduce(

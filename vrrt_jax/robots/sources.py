@@ -18,20 +18,57 @@ if TYPE_CHECKING:
     from vrrt_jax.robots.robot import Robot
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Source:
-    """A model of MuJoCo Menagerie."""
+    """Where the model of a packaged robot comes from, and how it is cleaned."""
 
-    folder: str
-    file: str
+    packages: Mapping[str, str]  # installed packages that carry it, and the file inside
+    menagerie: tuple[str, str] | None = None  # folder and file in MuJoCo Menagerie
+    install: str  # what brings it
     freeze: Mapping[str, float]  # joints that are not planned [rad] or [m]
+    root: str | None = None  # body that is the robot, put at the origin; the rest is scenery
+    exclude: tuple[tuple[str, str], ...] = ()  # bodies that only touch as the hulls of their meshes
+    hulls: bool = False  # collide the visual meshes, not the shipped shapes, which leave gaps
 
 
+_MENAGERIE = "mujoco-menagerie, or point MENAGERIE_ROOT at a checkout of MuJoCo Menagerie"
 _SOURCES = {
     "panda": _Source(
-        "franka_emika_panda", "panda.xml", {"finger_joint1": 0.04, "finger_joint2": 0.04}
-    )
+        packages={"genesis": "assets/xml/franka_emika_panda/panda.xml"},
+        menagerie=("franka_emika_panda", "panda.xml"),
+        install=_MENAGERIE,
+        freeze={"finger_joint1": 0.04, "finger_joint2": 0.04},
+    ),
+    "ur5e": _Source(
+        packages={"genesis": "assets/xml/universal_robots_ur5e/ur5e.xml"},
+        menagerie=("universal_robots_ur5e", "ur5e.xml"),
+        install=_MENAGERIE,
+        freeze={},
+        hulls=True,
+    ),
+    "fetch": _Source(
+        packages={"gymnasium_robotics": "envs/assets/fetch/reach.xml"},
+        install="--no-deps gymnasium-robotics==1.4.2",
+        freeze={
+            "robot0:slide0": 0.0,
+            "robot0:slide1": 0.0,
+            "robot0:slide2": 0.0,
+            "robot0:head_pan_joint": 0.0,
+            "robot0:head_tilt_joint": 0.06,
+            "robot0:r_gripper_finger_joint": 0.04,
+            "robot0:l_gripper_finger_joint": 0.04,
+        },
+        root="robot0:base_link",
+        # The torso is hollow where the shoulder turns.
+        exclude=(("robot0:torso_lift_link", "robot0:shoulder_lift_link"),),
+    ),
 }
+
+
+def install_hint(mesh_source: str | None) -> str:
+    """What to pip install for the true geometry of a robot."""
+    source = _SOURCES.get(str(mesh_source))
+    return source.install if source else _MENAGERIE
 
 
 def mesh_spec(robot: "Robot", *, visuals: bool = True) -> mujoco.MjSpec | None:
@@ -55,19 +92,25 @@ def mesh_spec(robot: "Robot", *, visuals: bool = True) -> mujoco.MjSpec | None:
     if path is None:
         return None
     spec = mjcf.read_spec(path)
-    mjcf.strip_spec(spec, visuals=visuals)
     source = _SOURCES.get(str(robot.mesh_source))
     fixed = source.freeze if source else {}
+    if source and source.root:
+        mjcf.keep_body(spec, source.root)
+    if source and source.hulls:
+        mjcf.collide_visuals(spec)
+    mjcf.strip_spec(spec, visuals=visuals)
     mjcf.freeze_joints(spec, {**fixed, **robot.frozen})
+    for first, second in source.exclude if source else ():
+        spec.add_exclude(bodyname1=first, bodyname2=second)
     return spec
 
 
 def mesh_file(mesh_source: str | None) -> Path | None:
     """The file with the true geometry of a robot.
 
-    A packaged robot is looked for in the checkout of MuJoCo Menagerie that the environment
-    variable MENAGERIE_ROOT names, in the cache of the package ``mujoco-menagerie``, and in an
-    installed ``genesis-world``. If none has it and ``mujoco-menagerie`` is installed, that package
+    A robot of MuJoCo Menagerie is looked for in the checkout that the environment variable
+    MENAGERIE_ROOT names, in the cache of the package ``mujoco-menagerie``, and in installed
+    packages that carry a copy. If none has it and ``mujoco-menagerie`` is installed, that package
     downloads it, once (3 MB).
 
     Args:
@@ -84,17 +127,18 @@ def mesh_file(mesh_source: str | None) -> Path | None:
     if mesh_source not in _SOURCES:
         return Path(mesh_source)
     source = _SOURCES[mesh_source]
-    return _in_root(source) or _cached(source) or _in_genesis(source) or _downloaded(source)
+    return _in_root(source) or _cached(source) or _in_packages(source) or _downloaded(source)
 
 
 def _in_root(source: _Source) -> Path | None:
     root = os.environ.get("MENAGERIE_ROOT")
-    if not root:
+    if not root or source.menagerie is None:
         return None
-    path = Path(root).expanduser() / source.folder / source.file
+    folder, file = source.menagerie
+    path = Path(root).expanduser() / folder / file
     if not path.is_file():
         raise FileNotFoundError(
-            f"MENAGERIE_ROOT is '{root}', which has no {source.folder}/{source.file}; expected a "
+            f"MENAGERIE_ROOT is '{root}', which has no {folder}/{file}; expected a "
             "checkout of MuJoCo Menagerie: correct the variable, or unset it"
         )
     return path
@@ -109,28 +153,32 @@ def _menagerie() -> ModuleType | None:
 
 def _cached(source: _Source) -> Path | None:
     menagerie = _menagerie()
-    if menagerie is None:
+    if menagerie is None or source.menagerie is None:
         return None
-    entry, cache = menagerie.get(source.folder), menagerie.Cache()
-    return cache.model_path(entry) / source.file if cache.is_cached(entry) else None
+    folder, file = source.menagerie
+    entry, cache = menagerie.get(folder), menagerie.Cache()
+    return cache.model_path(entry) / file if cache.is_cached(entry) else None
 
 
-def _in_genesis(source: _Source) -> Path | None:
-    # found without importing it: the import takes many seconds and needs a dozen packages
-    found = importlib.util.find_spec("genesis")
-    if found is None or not found.submodule_search_locations:
-        return None
-    path = Path(found.submodule_search_locations[0], "assets/xml", source.folder, source.file)
-    return path if path.is_file() else None
+def _in_packages(source: _Source) -> Path | None:
+    # found without importing them: the imports take many seconds and need a dozen packages
+    for package, file in source.packages.items():
+        found = importlib.util.find_spec(package)
+        if found is not None and found.submodule_search_locations:
+            path = Path(found.submodule_search_locations[0], file)
+            if path.is_file():
+                return path
+    return None
 
 
 def _downloaded(source: _Source) -> Path | None:
     # last, because it waits for minutes where the network is closed
     menagerie = _menagerie()
-    if menagerie is None:
+    if menagerie is None or source.menagerie is None:
         return None
+    folder, file = source.menagerie
     try:
-        return menagerie.get(source.folder).path() / source.file
+        return menagerie.get(folder).path() / file
     except menagerie.MenagerieError as error:
-        warnings.warn(f"the meshes of {source.folder} were not found: {error}", stacklevel=4)
+        warnings.warn(f"the meshes of {folder} were not found: {error}", stacklevel=4)
         return None

@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from vrrt_jax.core.kinematics import chain_from_model, link_poses
 from vrrt_jax.core.world import build_world, is_free
+from vrrt_jax.robots.robot import workspace
 from vrrt_jax.splat.camera import orbit, shrunk, stack_cameras
 from vrrt_jax.splat.loss import image_loss, psnr_db
 from vrrt_jax.splat.model import Level, SelfModel, save_self_model
@@ -47,10 +48,10 @@ class FitConfig:
     num_validation: int = 60
     image_px: int = 256
     fovy_deg: tuple[float, float] = (40.0, 55.0)
-    distance: tuple[float, float] = (1.6, 2.8)  # camera to target [m]
     elevation_deg: tuple[float, float] = (-75.0, 5.0)
-    target: tuple[float, float, float] = (0.0, 0.0, 0.4)  # [m]
-    target_spread: float = 0.15  # [m]
+    # in radii of the robot's workspace, whose centre the cameras look at
+    distance: tuple[float, float] = (1.5, 2.6)
+    target_spread: float = 0.15
     learning_rate: float = 0.1
     levels: tuple[LevelConfig, ...] = (
         LevelConfig(num_splats=300, size_px=32, steps=1000, batch=8),
@@ -143,13 +144,15 @@ def random_configurations(robot, num: int, rng: np.random.Generator) -> np.ndarr
     return found[:num]
 
 
-def random_camera(config: FitConfig, rng: np.random.Generator) -> Camera:
-    """A camera around the robot."""
+def random_camera(
+    config: FitConfig, centre: np.ndarray, radius: float, rng: np.random.Generator
+) -> Camera:
+    """A camera around a robot whose workspace has a centre (3,) and a radius [m]."""
     return orbit(
         azimuth_deg=rng.uniform(-180, 180),
         elevation_deg=rng.uniform(*config.elevation_deg),
-        distance=rng.uniform(*config.distance),
-        target=(np.array(config.target) + rng.normal(size=3) * config.target_spread).tolist(),
+        distance=radius * rng.uniform(*config.distance),
+        target=(centre + rng.normal(size=3) * radius * config.target_spread).tolist(),
         fovy_deg=rng.uniform(*config.fovy_deg),
         height=config.image_px,
         width=config.image_px,
@@ -168,7 +171,8 @@ def render_images(
     _, body_link, _ = chain_from_model(renderer.model)
     rng = np.random.default_rng(seed)
     q = random_configurations(robot, num, rng)
-    cameras = [random_camera(config, rng) for _ in range(num)]
+    centre, radius = workspace(robot)
+    cameras = [random_camera(config, centre, radius, rng) for _ in range(num)]
     rgb = np.zeros((num, config.image_px, config.image_px, 3), np.float16)
     coverage = np.zeros(rgb.shape[:3], np.float16)
     points = []

@@ -1,8 +1,9 @@
 """Images from MuJoCo's own renderer and a robot's true meshes; no screen is needed."""
 
+import contextlib
 import dataclasses
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import mujoco
 import numpy as np
@@ -22,6 +23,7 @@ class Picture:
 
     rgb: np.ndarray  # (H, W, 3) float32, the robot over black
     coverage: np.ndarray  # (H, W) float32
+    valid: np.ndarray  # (H, W) bool, False where an obstacle may hide the robot
 
 
 class MeshRenderer:
@@ -31,10 +33,13 @@ class MeshRenderer:
 
     Args:
         spec: the robot with its visual meshes; it is compiled here.
-        obstacles: drawn too, by :meth:`scene`.
+        obstacles: drawn too by :meth:`scene`, and in the way of :meth:`picture`.
+        light: brightness of the lamp; 1 is what self-models are trained with.
     """
 
-    def __init__(self, spec: mujoco.MjSpec, obstacles: Sequence[Obstacle] = ()):
+    def __init__(
+        self, spec: mujoco.MjSpec, obstacles: Sequence[Obstacle] = (), *, light: float = 1.0
+    ):
         """Compile the model; raises RuntimeError if OpenGL is not available."""
         spec = spec.copy()
         for obstacle in obstacles:
@@ -50,7 +55,7 @@ class MeshRenderer:
         for light in list(spec.lights):
             spec.delete(light)
         headlight = spec.visual.headlight
-        headlight.ambient, headlight.diffuse = [0.35] * 3, [0.6] * 3
+        headlight.ambient, headlight.diffuse = [0.35 * light] * 3, [0.6 * light] * 3
         headlight.specular = [0.02] * 3
         spec.visual.quality.shadowsize = 0
         spec.visual.quality.offsamples = 0
@@ -69,16 +74,21 @@ class MeshRenderer:
         self._renderer((8, 8))
 
     def picture(self, q: np.ndarray, camera: Camera) -> Picture:
-        """The robot alone over black, with its exact coverage."""
+        """The robot alone over black, with its exact coverage; obstacles only hide it."""
         scale = max(1, min(SUPERSAMPLING, MAX_RENDER_PX // max(camera.height, camera.width)))
-        renderer = self._aim(q, camera, scale)
-        rgb = renderer.render().astype(np.float32) / 255.0
-        renderer.enable_segmentation_rendering()
-        mask = renderer.render()[..., 0] >= 0
-        renderer.disable_segmentation_rendering()
+        with self._drawing_obstacles():
+            renderer = self._aim(q, camera, scale)
+            rgb = renderer.render().astype(np.float32) / 255.0
+            renderer.enable_segmentation_rendering()
+            segments = renderer.render()
+            renderer.disable_segmentation_rendering()
+        is_geom = segments[..., 1] == mujoco.mjtObj.mjOBJ_GEOM
+        group = np.append(self.model.geom_group, -1)[np.where(is_geom, segments[..., 0], -1)]
+        mask = is_geom & (group != OBSTACLE_GROUP)
         return Picture(
             rgb=_block_mean(rgb * mask[..., None], scale),
             coverage=_block_mean(mask.astype(np.float32), scale),
+            valid=_block_mean((group != OBSTACLE_GROUP).astype(np.float32), scale) > 0.999,
         )
 
     def surface(self, q: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -98,17 +108,22 @@ class MeshRenderer:
 
     def scene(self, q: np.ndarray, camera: Camera) -> np.ndarray:
         """Robot and obstacles for people to look at: (H, W, 3) uint8."""
-        self._option.geomgroup[OBSTACLE_GROUP] = 1
-        try:
-            scale = max(1, min(2, MAX_RENDER_PX // max(camera.height, camera.width)))
+        scale = max(1, min(2, MAX_RENDER_PX // max(camera.height, camera.width)))
+        with self._drawing_obstacles():
             renderer = self._aim(q, camera, scale)
             image = renderer.render().astype(np.float32)
             renderer.enable_segmentation_rendering()
             image[renderer.render()[..., 0] < 0] = 250.0
             renderer.disable_segmentation_rendering()
+        return _block_mean(image, scale).astype(np.uint8)
+
+    @contextlib.contextmanager
+    def _drawing_obstacles(self) -> Iterator[None]:
+        self._option.geomgroup[OBSTACLE_GROUP] = 1
+        try:
+            yield
         finally:
             self._option.geomgroup[OBSTACLE_GROUP] = 0
-        return _block_mean(image, scale).astype(np.uint8)
 
     def _aim(self, q: np.ndarray, camera: Camera, scale: int) -> mujoco.Renderer:
         renderer = self._renderer((camera.height * scale, camera.width * scale))

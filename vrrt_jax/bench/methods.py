@@ -1,0 +1,179 @@
+"""Solve one task with one method, and say what became of it."""
+
+import dataclasses
+import functools
+import time
+import zlib
+from typing import Any
+
+import jax
+import numpy as np
+
+from vrrt_jax import baselines, planner
+from vrrt_jax.bench.tasks import (
+    Scenery,
+    Task,
+    bench_robot,
+    bench_world,
+    cameras,
+    goal_images,
+    image_psnr,
+    joint_error,
+)
+from vrrt_jax.config import PlannerConfig
+from vrrt_jax.core.types import Status
+from vrrt_jax.core.verify import verify_path
+from vrrt_jax.core.world import obstacle_list
+from vrrt_jax.problems import self_model_path
+from vrrt_jax.splat.model import SelfModel, load_self_model
+
+METHODS = ("vrrt", "dr-robot", "prof-robot", "dr-robot-rrt-star")
+CONFIGS = ("default", "paper")
+SUCCESS_RAD = 0.05  # mean joint error, as in the paper
+CAUSES = (
+    "no match found",
+    "matched the wrong pose",
+    "right pose, no path",
+    "out of time",
+    "invalid path",
+)
+
+
+@functools.cache
+def _self_model(robot_name: str) -> SelfModel:
+    return load_self_model(self_model_path(bench_robot(robot_name)))
+
+
+@functools.cache
+def _classifier(robot_name: str, world: str) -> baselines.Classifier:
+    trained, _ = baselines.train_classifier(bench_robot(robot_name), bench_world(robot_name, world))
+    return trained
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Attempt:
+    """What a method came back with."""
+
+    path: np.ndarray  # (P, D)
+    matched: bool  # the image of its end is within the bar
+    has_path: bool  # False if a goal was found, but no way to it
+    out_of_time: bool
+    loss: float
+    search_s: float  # planning, without compilation
+
+
+def solve(
+    robot_name: str,
+    task: Task,
+    *,
+    method: str,
+    config: PlannerConfig,
+    scenery: Scenery,
+    seed: int,
+    guess_sigma: float = 0.0,
+    collisions: bool = True,
+) -> dict[str, Any]:
+    """Run a method on a task and judge the outcome as the paper does.
+
+    Args:
+        robot_name: one of the benchmark's.
+        task: from :func:`make_task`.
+        method: one of :data:`METHODS`.
+        config: of Visual-RRT.
+        scenery: what the goal images look like.
+        seed: of the method; the task's index is folded in.
+        guess_sigma: if positive, Visual-RRT is also told the goal with that much noise [rad].
+        collisions: False judges the pose alone.
+
+    Returns:
+        A row for the results file.
+    """
+    robot, world = bench_robot(robot_name), bench_world(robot_name, task.world)
+    images, masks = goal_images(robot_name, task, scenery)
+    task_seed = zlib.crc32(f"{seed} {task.level:.3f} {task.index}".encode())
+    key = jax.random.key(task_seed)
+    inputs = (
+        robot,
+        world,
+        _self_model(robot_name),
+        cameras(robot_name, scenery),
+        images,
+        task.q_start,
+    )
+    started = time.perf_counter()
+    if method == "vrrt":
+        noise = np.random.default_rng(task_seed).normal(size=robot.num_joints)
+        guess = task.q_goal + guess_sigma * noise
+        guess = np.where(robot.wraps, guess, np.clip(guess, robot.lower, robot.upper))
+        attempt = _plan(inputs, key, config, masks, guess if guess_sigma > 0 else None)
+    else:
+        attempt = _baseline(inputs, robot_name, task, method, key, masks)
+    wall_s = time.perf_counter() - started
+
+    error = joint_error(world, attempt.path[-1], task.q_goal)
+    right = bool(error.mean() < SUCCESS_RAD)
+    valid = not collisions or verify_path(robot, obstacle_list(world), attempt.path).ok
+    success = right and valid and attempt.has_path
+    cause = ""
+    if not success:
+        cause = _cause(attempt, right=right, valid=valid)
+    return {
+        "level": task.level,
+        "index": task.index,
+        "world": task.world,
+        "straight_is_blocked": task.straight_is_blocked,
+        "success": success,
+        "cause": cause,
+        "mean_error_rad": round(float(error.mean()), 5),
+        "max_error_rad": round(float(error.max()), 5),
+        "l2_error_rad": round(float(np.linalg.norm(error)), 5),
+        "path_length": round(_length(world, attempt.path), 4),
+        "loss": float(f"{attempt.loss:.4g}"),
+        "psnr_db": round(image_psnr(robot_name, attempt.path[-1], images, scenery), 2),
+        "time_s": round(attempt.search_s, 3),
+        "wall_s": round(wall_s, 2),
+    }
+
+
+def _length(world, path: np.ndarray) -> float:
+    steps = [joint_error(world, a, b) for a, b in zip(path, path[1:], strict=False)]
+    return float(sum(np.linalg.norm(step) for step in steps))
+
+
+def _cause(attempt: Attempt, *, right: bool, valid: bool) -> str:
+    if attempt.out_of_time:
+        return "out of time"
+    if right:
+        return "invalid path" if attempt.has_path and not valid else "right pose, no path"
+    return "matched the wrong pose" if attempt.matched else "no match found"
+
+
+def _plan(inputs, key, config: PlannerConfig, masks, guess) -> Attempt:
+    result = planner.plan(*inputs, key=key, config=config, mask=masks, q_guess=guess)
+    times = result.timing
+    return Attempt(
+        path=result.path if result.status is not Status.NO_PATH else result.target[None],
+        matched=result.loss <= result.goal_loss,
+        has_path=result.status is not Status.NO_PATH,
+        out_of_time=result.status is Status.TIME_LIMIT,
+        loss=result.loss,
+        search_s=times["search_s"] + times["shortcut_s"] + times["verify_s"],
+    )
+
+
+def _baseline(inputs, robot_name: str, task: Task, method: str, key, masks) -> Attempt:
+    if method == "dr-robot-rrt-star":
+        found = baselines.dr_robot_rrt_star(*inputs, key=key, mask=masks)
+    else:
+        classifier = None
+        if method == "prof-robot" and task.world:
+            classifier = _classifier(robot_name, task.world)
+        found = baselines.dr_robot(*inputs, classifier=classifier, mask=masks)
+    return Attempt(
+        path=found.path,
+        matched=found.loss <= found.goal_loss,
+        has_path=found.found_path,
+        out_of_time=False,
+        loss=found.loss,
+        search_s=found.search_s,
+    )

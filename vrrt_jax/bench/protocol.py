@@ -1,0 +1,93 @@
+"""The benchmarks by name: the paper's tasks, pose reconstruction, the ablations."""
+
+import dataclasses
+from collections.abc import Sequence
+
+from vrrt_jax.bench.methods import CONFIGS, METHODS
+from vrrt_jax.bench.runner import Benchmark, Variant
+from vrrt_jax.bench.tasks import ROBOTS, Scenery
+from vrrt_jax.config import PlannerConfig
+
+# Each against the paper's settings; the values that the paper varies.
+ABLATIONS = {
+    "exploration": (0.1, 0.3, 0.5, 0.7, 0.9),
+    "eta": (0.0, 0.2, 0.4, 0.6, 0.8, 1.0),
+    "kappa": (0.5, 0.8, 0.9, 0.95, 0.99),
+    "beta1": (0.5, 0.9, 0.99),
+    "beta2": (0.9, 0.999),
+    "lanes": (8, 32, 128),
+    "inherit": (True, False),
+}
+GUESS_SIGMAS = (0.05, 0.10, 0.15, 0.20)  # [rad]
+
+
+def benchmark(
+    what: str,
+    robot: str,
+    *,
+    levels: Sequence[float],
+    tasks_per_level: int,
+    seed: int,
+    method: str = "vrrt",
+    config: str = "default",
+    only: str | None = None,
+    scenery: Scenery | None = None,
+    time_limit_s: float = 60.0,
+) -> Benchmark:
+    """Put a benchmark together.
+
+    Args:
+        what: "visual" (the paper's tasks), "pose" (no obstacles) or "ablation".
+        robot: one of :data:`~vrrt_jax.bench.tasks.ROBOTS`.
+        levels: distances from start to goal [rad].
+        tasks_per_level: number of tasks at each.
+        seed: of tasks and method.
+        method: one of :data:`~vrrt_jax.bench.methods.METHODS`.
+        config: "default" or "paper"; ablations vary the paper's.
+        only: one of the ablations, all of them if None.
+        scenery: what goal images look like.
+        time_limit_s: of one search [s].
+
+    Raises:
+        ValueError: a name is unknown, or a number makes no sense.
+    """
+    for name, value, known in (
+        ("robot", robot, ROBOTS),
+        ("method", method, METHODS),
+        ("config", config, CONFIGS),
+        ("ablation", only or "eta", (*ABLATIONS, "guess")),
+    ):
+        if value not in known:
+            raise ValueError(f"unknown {name} '{value}'; have: {', '.join(known)}")
+    if tasks_per_level < 1 or not levels or min(levels) <= 0:
+        raise ValueError(
+            f"got levels {list(levels)} and {tasks_per_level} tasks a level; expected distances "
+            "above 0 and at least one task"
+        )
+    make = PlannerConfig.paper if config == "paper" else PlannerConfig
+    base = Variant(name=method, method=method, config=make(time_limit_s=time_limit_s))
+    return Benchmark(
+        what=what,
+        robot=robot,
+        levels=tuple(levels),
+        tasks_per_level=tasks_per_level,
+        seed=seed,
+        variants=_ablations(only, time_limit_s) if what == "ablation" else (base,),
+        scenery=scenery or Scenery(),
+    )
+
+
+def _ablations(only: str | None, time_limit_s: float) -> tuple[Variant, ...]:
+    paper = PlannerConfig.paper(time_limit_s=time_limit_s)
+    variants = [
+        Variant(name=f"{field}={value}", config=dataclasses.replace(paper, **{field: value}))
+        for field, values in ABLATIONS.items()
+        if only in (None, field)
+        for value in values
+    ]
+    if only in (None, "guess"):
+        variants += [
+            Variant(name=f"guess={sigma}", config=paper, guess_sigma=sigma)
+            for sigma in GUESS_SIGMAS
+        ]
+    return tuple(variants)

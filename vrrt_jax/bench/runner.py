@@ -1,0 +1,231 @@
+"""Run many tasks: streamed to a file, resumed from it, over several processes."""
+
+import concurrent.futures
+import dataclasses
+import json
+import multiprocessing
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from vrrt_jax.bench.methods import CAUSES, solve
+from vrrt_jax.bench.tasks import Scenery, make_task
+from vrrt_jax.config import PlannerConfig
+from vrrt_jax.report import versions
+
+FORMAT = 1
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Variant:
+    """One row of an ablation, or the only row of a benchmark."""
+
+    name: str
+    config: PlannerConfig
+    method: str = "vrrt"
+    guess_sigma: float = 0.0  # [rad]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Benchmark:
+    """Everything that decides the numbers."""
+
+    what: str  # visual, pose or ablation
+    robot: str
+    levels: tuple[float, ...]
+    tasks_per_level: int
+    seed: int
+    variants: tuple[Variant, ...]
+    scenery: Scenery
+
+    @property
+    def collisions(self) -> bool:
+        """Whether there are obstacles, and paths are judged."""
+        return self.what != "pose"
+
+    def header(self) -> dict[str, Any]:
+        """What a results file must agree on, to be gone on with."""
+        return {
+            "format": FORMAT,
+            **{name: getattr(self, name) for name in ("what", "robot", "seed")},
+            "scenery": dataclasses.asdict(self.scenery),
+            "variants": [_plain(dataclasses.asdict(variant)) for variant in self.variants],
+            "versions": versions(),
+        }
+
+
+def run(benchmark: Benchmark, file: str | Path | None, *, jobs: int = 1) -> dict[str, Any]:
+    """Run what is not in the file yet, and write every task at once.
+
+    Args:
+        benchmark: what to run; more levels or tasks than the file has are added to it.
+        file: JSON for the results, None to keep them in memory.
+        jobs: processes.
+
+    Returns:
+        What the file holds: the header, ``tasks``, and a summary of each variant.
+
+    Raises:
+        ValueError: the file holds another benchmark, version or seed.
+        OSError: the file cannot be written; what it held stays.
+    """
+    results = _resume(benchmark, Path(file)) if file is not None else _fresh(benchmark)
+    done = {_key(row) for row in results["tasks"]}
+    todo = [
+        (variant.name, level, index)
+        for index in range(benchmark.tasks_per_level)
+        for level in benchmark.levels
+        for variant in benchmark.variants
+        if (variant.name, level, index) not in done
+    ]
+    with tqdm(total=len(todo), unit="task", disable=None) as bar:
+        won = 0
+        for count, row in enumerate(_rows(benchmark, todo, jobs), 1):
+            results["tasks"].append(row)
+            results.update(_summary(benchmark, results["tasks"]))
+            if file is not None:
+                _write(Path(file), results)
+            won += row["success"]
+            bar.set_postfix_str(f"{100 * won / count:.0f} % solved")
+            bar.update()
+    results.update(_summary(benchmark, results["tasks"]))
+    return results
+
+
+def _rows(benchmark: Benchmark, todo: Sequence[tuple], jobs: int) -> Iterator[dict[str, Any]]:
+    if jobs == 1:
+        for item in todo:
+            yield _run_task(benchmark, item)
+        return
+    context = multiprocessing.get_context("spawn")
+    cores = context.Queue()
+    available = sorted(os.sched_getaffinity(0))
+    for worker in range(jobs):
+        cores.put(available[worker % len(available) :: jobs] or available)
+    pool = concurrent.futures.ProcessPoolExecutor(jobs, context, _pin, (cores,))
+    try:
+        pending = [pool.submit(_run_task, benchmark, item) for item in todo]
+        for finished in concurrent.futures.as_completed(pending):
+            yield finished.result()
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _pin(cores: Any) -> None:
+    """Give a worker cores of its own, or several would fight for all of them."""
+    os.sched_setaffinity(0, cores.get())
+
+
+def _run_task(benchmark: Benchmark, item: tuple[str, float, int]) -> dict[str, Any]:
+    name, level, index = item
+    variant = next(v for v in benchmark.variants if v.name == name)
+    task = make_task(benchmark.robot, level, index, benchmark.seed, obstacles=benchmark.collisions)
+    row = solve(
+        benchmark.robot,
+        task,
+        method=variant.method,
+        config=variant.config,
+        scenery=benchmark.scenery,
+        seed=benchmark.seed,
+        guess_sigma=variant.guess_sigma,
+        collisions=benchmark.collisions,
+    )
+    return {"variant": name, **row}
+
+
+def _key(row: dict[str, Any]) -> tuple[str, float, int]:
+    return row["variant"], row["level"], row["index"]
+
+
+def _fresh(benchmark: Benchmark) -> dict[str, Any]:
+    return {**benchmark.header(), "tasks": []}
+
+
+def _resume(benchmark: Benchmark, file: Path) -> dict[str, Any]:
+    if not file.exists():
+        _write(file, _fresh(benchmark))  # a bad path is told before hours of work
+        return _fresh(benchmark)
+    try:
+        results = json.loads(file.read_text())
+        old = {name: results[name] for name in benchmark.header()}
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"'{file}' is no results file of this version ({error!r}); choose another --json"
+        ) from None
+    for name, value in benchmark.header().items():
+        if old[name] != value:
+            raise ValueError(
+                f"'{file}' has {name} {old[name]!r}, this run {value!r}: results of different "
+                "runs are not mixed; choose another --json"
+            )
+    return results
+
+
+def _write(file: Path, results: dict[str, Any]) -> None:
+    """Replace the file at once; if that fails, what it held stays."""
+    part = file.with_name(file.name + ".part")
+    try:
+        part.write_text(json.dumps(results, indent=1) + "\n")
+        part.replace(file)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OSError(
+            f"cannot write '{file}': {error.strerror}; what it held is kept, and the same command "
+            "goes on from there"
+        ) from None
+
+
+def _summary(benchmark: Benchmark, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Success and more by level; of an ablation, by variant."""
+    by_variant = {
+        variant.name: summarise([row for row in rows if row["variant"] == variant.name])
+        for variant in benchmark.variants
+    }
+    if len(by_variant) == 1:
+        return next(iter(by_variant.values()))
+    return {"by_variant": by_variant}
+
+
+def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """``average_success``, the mean of the levels', and ``levels``."""
+    levels = []
+    for level in sorted({row["level"] for row in rows}):
+        own = [row for row in rows if row["level"] == level]
+        won = [row for row in own if row["success"]]
+        levels.append(
+            {
+                "distance_rad": level,
+                "n": len(own),
+                "success": _mean(row["success"] for row in own),
+                "median_time_s": _median(row["time_s"] for row in own),
+                "p95_time_s": round(float(np.quantile([row["time_s"] for row in own], 0.95)), 2),
+                "path_length": _mean(row["path_length"] for row in won),
+                "mean_error_rad": _mean(row["mean_error_rad"] for row in own),
+                "median_psnr_db": _median(row["psnr_db"] for row in own),
+                "straight_is_blocked": _mean(row["straight_is_blocked"] for row in own),
+                "causes": {
+                    cause: count
+                    for cause in CAUSES
+                    if (count := sum(row["cause"] == cause for row in own))
+                },
+            }
+        )
+    return {"average_success": _mean(level["success"] for level in levels), "levels": levels}
+
+
+def _mean(values) -> float | None:
+    values = list(values)
+    return round(float(np.mean(values)), 4) if values else None
+
+
+def _median(values) -> float:
+    return round(float(np.median(list(values))), 3)
+
+
+def _plain(fields: dict[str, Any]) -> dict[str, Any]:
+    """What JSON gives back unchanged."""
+    return json.loads(json.dumps(fields))

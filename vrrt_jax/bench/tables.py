@@ -1,0 +1,200 @@
+"""Benchmark results as tables and figures, beside the paper's own numbers."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from vrrt_jax.bench.methods import CAUSES, METHODS
+from vrrt_jax.bench.tasks import ROBOTS
+
+# Average success over the five levels [%]; Visual-RRT (CVPR 2026), on an RTX 4090.
+PAPER = {
+    "panda": {"dr-robot": 19.3, "prof-robot": 23.6, "dr-robot-rrt-star": 23.8, "vrrt": 75.2},
+    "ur5e": {"dr-robot": 25.9, "prof-robot": 28.0, "dr-robot-rrt-star": 28.1, "vrrt": 79.8},
+    "fetch": {"dr-robot": 18.7, "prof-robot": 21.9, "dr-robot-rrt-star": 22.4, "vrrt": 73.4},
+}
+PAPER_NOTE = (
+    "The paper's numbers are its own: other worlds, tasks and self-models, 100 tasks a level, on "
+    "an NVIDIA RTX 4090; 21.6 s a plan for the Panda."
+)
+CAUSE_COLOURS = ("#4878a8", "#d9903d", "#8a8a8a", "#7a5aa6", "#b5433f")
+
+
+def to_text(results: dict[str, Any]) -> str:
+    """A results file as a Markdown table."""
+    rows = []
+    for name, summary in _variants(results).items():
+        for level in summary["levels"]:
+            causes = ", ".join(f"{cause} {n}" for cause, n in level["causes"].items())
+            rows.append(
+                [
+                    name,
+                    f"{level['distance_rad']:g}",
+                    str(level["n"]),
+                    _percent(level["success"]),
+                    f"{level['median_time_s']:.2f}",
+                    f"{level['p95_time_s']:.2f}",
+                    "" if level["path_length"] is None else f"{level['path_length']:.2f}",
+                    f"{level['mean_error_rad']:.3f}",
+                    f"{level['median_psnr_db']:.1f}",
+                    causes,
+                ]
+            )
+        if len(summary["levels"]) > 1:
+            average = _percent(summary["average_success"])
+            rows.append([name, "average", "", average, *[""] * 6])
+    heads = (
+        "method",
+        "level [rad]",
+        "n",
+        "success [%]",
+        "median time [s]",
+        "95 % [s]",
+        "path [rad]",
+        "mean error [rad]",
+        "PSNR [dB]",
+        "causes of failure",
+    )
+    return _table(heads, rows)
+
+
+def write_page(files: Sequence[Path], folder: Path) -> Path:
+    """Write ``README.md`` and its figures for results of any number of benchmarks.
+
+    Raises:
+        ValueError: a file is no results file.
+    """
+    found = [_read(file) for file in files]
+    parts = ["# Results", "", PAPER_NOTE, ""]
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for results in found:
+        groups.setdefault((results["what"], results["robot"]), []).append(results)
+    overview = _overview(found)
+    if overview:
+        parts += ["## Average success [%]", "", overview, ""]
+    for (what, robot), group in sorted(groups.items()):
+        parts += [f"## {what}: {robot}", ""]
+        for results in group:
+            parts += [f"`{_command(results)}`", "", to_text(results), ""]
+        name = f"{what}_{robot}.png"
+        _figure(group, folder / name)
+        parts += [f"![success, causes, times and path lengths]({name})", ""]
+    page = folder / "README.md"
+    page.write_text("\n".join(parts))
+    return page
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        results = json.loads(file.read_text())
+        return {**results, "rows": results["tasks"], "names": list(_variants(results))}
+    except (OSError, ValueError, KeyError) as error:
+        raise ValueError(f"'{file}' is no results file of vrrt bench: {error!r}") from None
+
+
+def _variants(results: dict[str, Any]) -> dict[str, Any]:
+    if "by_variant" in results:
+        return {k: v for k, v in results["by_variant"].items() if v["levels"]}
+    return {_label(results): {k: results[k] for k in ("average_success", "levels")}}
+
+
+def _label(results: dict[str, Any]) -> str:
+    method = results["variants"][0]["method"]
+    if method != "vrrt":
+        return method
+    return "vrrt, paper's settings" if _is_paper(results) else "vrrt, default"
+
+
+def _is_paper(results: dict[str, Any]) -> bool:
+    return results["variants"][0]["config"]["probes"] == 0
+
+
+def _command(results: dict[str, Any]) -> str:
+    words = ["vrrt bench", results["what"], "--robot", results["robot"]]
+    if results["what"] != "ablation":
+        words += ["--method", results["variants"][0]["method"]]
+        words += ["--config", "paper" if _is_paper(results) else "default"]
+    scenery = results["scenery"]
+    words += ["--views 2"] if scenery["views"] == 2 else []
+    words += ["--occluded"] if scenery["occluded"] else []
+    words += [f"--light {scenery['light']:g}"] if scenery["light"] != 1.0 else []
+    words += [f"--azimuth {scenery['azimuth_deg']:g}"] if scenery["azimuth_deg"] else []
+    levels = sorted({row["level"] for row in results["tasks"]})
+    words += ["--levels", ",".join(f"{level:g}" for level in levels)]
+    most = 1 + max((row["index"] for row in results["tasks"]), default=0)
+    words += ["--tasks-per-level", str(most), "--seed", str(results["seed"])]
+    return " ".join(words)
+
+
+def _overview(found: Sequence[dict[str, Any]]) -> str:
+    """Methods by robots, with the paper's numbers beside ours."""
+    rows = []
+    for method in METHODS:
+        for is_paper in (True, False) if method == "vrrt" else (False,):
+            cells = []
+            for robot in ROBOTS:
+                own = [
+                    results
+                    for results in found
+                    if (results["what"], results["robot"]) == ("visual", robot)
+                    and results["variants"][0]["method"] == method
+                    and (method != "vrrt" or _is_paper(results) == is_paper)
+                    and results["scenery"]["views"] == 1
+                ]
+                ours = _percent(own[0]["average_success"]) if own else "not run"
+                n = f" (n = {len(own[0]['tasks'])})" if own else ""
+                cells.append(f"{ours}{n} / {PAPER[robot][method]}")
+            settings = {True: ", paper's settings", False: ", default"}[is_paper]
+            rows.append([method + (settings if method == "vrrt" else ""), *cells])
+    return _table(("method", *(f"{robot}: ours / paper" for robot in ROBOTS)), rows)
+
+
+def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
+    """Success by level, causes of failure, times and path lengths."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, 2, figsize=(12, 8), layout="constrained")
+    (by_level, causes), (times, lengths) = axes
+    labels, stacks = [], []
+    for results in group:
+        for name, summary in _variants(results).items():
+            levels = summary["levels"]
+            distance = [level["distance_rad"] for level in levels]
+            by_level.plot(distance, [100 * v["success"] for v in levels], "o-", label=name)
+            lengths.plot(
+                distance, [v["path_length"] or float("nan") for v in levels], "o-", label=name
+            )
+            labels.append(name)
+            stacks.append([sum(v["causes"].get(c, 0) for v in levels) for c in CAUSES])
+            rows = results["tasks"]
+            if "by_variant" in results:
+                rows = [row for row in rows if row["variant"] == name]
+            times.hist([row["time_s"] for row in rows], bins=20, histtype="step", label=name)
+    left = [0] * len(labels)
+    for cause, colour, k in zip(CAUSES, CAUSE_COLOURS, range(len(CAUSES)), strict=True):
+        width = [stack[k] for stack in stacks]
+        causes.barh(labels, width, left=left, color=colour, label=cause)
+        left = [a + b for a, b in zip(left, width, strict=True)]
+    by_level.set(xlabel="distance from start to goal [rad]", ylabel="success [%]", ylim=(0, 102))
+    causes.set(xlabel="failed tasks")
+    causes.invert_yaxis()
+    times.set(xlabel="planning time without compilation [s]", ylabel="tasks")
+    lengths.set(xlabel="distance from start to goal [rad]", ylabel="path length [rad]")
+    for axis in (by_level, causes, times):
+        axis.legend(fontsize="small")
+    figure.suptitle(f"{group[0]['what']}: {group[0]['robot']}")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _percent(share: float | None) -> str:
+    return "" if share is None else f"{100 * share:.1f}"
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -1,0 +1,187 @@
+"""The paper's protocol: seeded tasks at set distances, goal images from the true meshes."""
+
+import dataclasses
+import functools
+import zlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax.core.edges import difference, into_limits
+from vrrt_jax.core.types import Obstacle
+from vrrt_jax.core.verify import contacts, verify_path
+from vrrt_jax.core.world import World, build_world, is_free, obstacle_list
+from vrrt_jax.problems import load_world
+from vrrt_jax.robots import Robot, load_robot
+from vrrt_jax.robots.robot import workspace
+from vrrt_jax.robots.sources import install_hint, mesh_spec
+from vrrt_jax.splat.camera import orbit
+from vrrt_jax.splat.mujoco_images import MeshRenderer
+from vrrt_jax.splat.types import Camera
+
+ROBOTS = ("panda", "ur5e", "fetch")
+LEVELS = (0.5, 1.0, 1.5, 2.0, 2.5)  # ||q_start - q_goal|| [rad]
+WORLDS_PER_ROBOT = 6
+NUM_SLOTS = 12  # one shape for all worlds, so that none re-compiles
+IMAGE_PX = 480
+AZIMUTHS_DEG = (180.0, 90.0)  # of the first and the second view: from the front, from the right
+ELEVATION_DEG = -30.0
+DISTANCE = 2.1  # of the camera, in radii of the workspace
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scenery:
+    """What goal images look like."""
+
+    views: int = 1
+    azimuth_deg: float = 0.0  # added to the cameras' own
+    light: float = 1.0  # brightness of the lamp
+    occluded: bool = False  # obstacles are drawn, and the pixels that they take masked out
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Task:
+    """Where from and where to; ``q_goal`` is for rendering and scoring alone."""
+
+    level: float  # distance from start to goal [rad]
+    index: int
+    world: str  # its packaged name; "" for none
+    q_start: np.ndarray  # (D,)
+    q_goal: np.ndarray  # (D,)
+    straight_is_blocked: bool
+
+
+@functools.cache
+def bench_robot(name: str) -> Robot:
+    """A robot of the benchmark.
+
+    Raises:
+        ValueError: the name is unknown.
+    """
+    if name not in ROBOTS:
+        raise ValueError(f"unknown robot '{name}'; have: {', '.join(ROBOTS)}")
+    return load_robot(name)
+
+
+@functools.cache
+def bench_world(robot: str, name: str) -> World:
+    """A packaged world with the benchmark's number of slots, or an empty one."""
+    if not name:
+        return build_world(bench_robot(robot), [], num_slots=NUM_SLOTS)
+    return load_world(name, bench_robot(robot), num_slots=NUM_SLOTS)
+
+
+def make_task(robot_name: str, level: float, index: int, seed: int, *, obstacles: bool) -> Task:
+    """Draw a task: free ends inside the limits, a set distance apart.
+
+    Tasks take turns among the robot's worlds. The same arguments always give the same task.
+
+    Args:
+        robot_name: one of :data:`ROBOTS`.
+        level: distance from start to goal [rad].
+        index: of the task at this level.
+        seed: of the benchmark.
+        obstacles: whether there are any.
+    """
+    robot = bench_robot(robot_name)
+    name = f"{robot_name}_{1 + index % WORLDS_PER_ROBOT}" if obstacles else ""
+    world = bench_world(robot_name, name)
+    listed = obstacle_list(world)
+    key = f"{robot_name} {level:.3f} {index} {obstacles}"
+    rng = np.random.default_rng([seed, zlib.crc32(key.encode())])
+    while True:
+        q_start = rng.uniform(robot.lower, robot.upper, (256, robot.num_joints))
+        step = rng.normal(size=q_start.shape)
+        q_goal = q_start + level * step / np.linalg.norm(step, axis=1, keepdims=True)
+        inside = robot.wraps | ((q_goal > robot.lower) & (q_goal < robot.upper))
+        q_goal = np.asarray(into_limits(world, jnp.asarray(q_goal, jnp.float32)))
+        free = [
+            np.asarray(_are_free(world, jnp.asarray(q, jnp.float32))) for q in (q_start, q_goal)
+        ]
+        for i in np.flatnonzero(inside.all(1) & free[0] & free[1]):
+            ends = q_start[i].astype(np.float32), q_goal[i]
+            if any(contacts(robot, listed, q) for q in ends):
+                continue
+            straight = verify_path(robot, listed, np.stack(ends), step=0.02)
+            return Task(
+                level=level,
+                index=index,
+                world=name,
+                q_start=ends[0],
+                q_goal=ends[1],
+                straight_is_blocked=not straight.ok,
+            )
+
+
+_are_free = jax.jit(jax.vmap(is_free, (None, 0)))
+
+
+def joint_error(world: World, q: np.ndarray, q_goal: np.ndarray) -> np.ndarray:
+    """Distance (D,) of each joint from the goal, the short way round [rad] or [m]."""
+    return np.abs(np.asarray(difference(world, jnp.asarray(q), jnp.asarray(q_goal))))
+
+
+@functools.cache
+def cameras(robot_name: str, scenery: Scenery) -> tuple[Camera, ...]:
+    """The views of a robot's workspace."""
+    centre, radius = workspace(bench_robot(robot_name))
+    return tuple(
+        orbit(
+            azimuth_deg=azimuth + scenery.azimuth_deg,
+            elevation_deg=ELEVATION_DEG,
+            distance=DISTANCE * radius,
+            target=centre.tolist(),
+            height=IMAGE_PX,
+            width=IMAGE_PX,
+        )
+        for azimuth in AZIMUTHS_DEG[: scenery.views]
+    )
+
+
+def goal_images(
+    robot_name: str, task: Task, scenery: Scenery
+) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
+    """Images (H, W, 4) of the robot at the goal, and masks (H, W) of what may be compared.
+
+    Raises:
+        ValueError: the robot's meshes are not on this machine.
+        RuntimeError: OpenGL is not available.
+    """
+    world = bench_world(robot_name, task.world)
+    hiding = tuple(obstacle_list(world)) if scenery.occluded else ()
+    renderer = _renderer(robot_name, hiding, scenery.light)
+    images, masks = [], []
+    for camera in cameras(robot_name, scenery):
+        picture = renderer.picture(task.q_goal, camera)
+        images.append(np.concatenate([picture.rgb, picture.coverage[..., None]], axis=-1))
+        masks.append(picture.valid)
+    # The robot comes over black; a goal image has straight colours beside its mask.
+    for image in images:
+        image[..., :3] /= np.maximum(image[..., 3:], 1e-3)
+        np.clip(image, 0.0, 1.0, out=image)
+    return images, masks if scenery.occluded else None
+
+
+@functools.lru_cache(maxsize=2)
+def _renderer(robot_name: str, hiding: tuple[Obstacle, ...], light: float) -> MeshRenderer:
+    robot = bench_robot(robot_name)
+    spec = mesh_spec(robot)
+    if spec is None:
+        raise ValueError(
+            f"goal images need the meshes of '{robot_name}', which are not on this machine: pip "
+            f"install {install_hint(robot.mesh_source)}"
+        )
+    return MeshRenderer(spec, hiding, light=light)
+
+
+def image_psnr(robot_name: str, q: np.ndarray, images: list[np.ndarray], scenery: Scenery) -> float:
+    """PSNR of the true meshes at ``q`` against the goal images, over white [dB]."""
+    renderer = _renderer(robot_name, (), scenery.light)
+    errors = []
+    for camera, image in zip(cameras(robot_name, scenery), images, strict=True):
+        picture = renderer.picture(q, camera)
+        over_white = picture.rgb + 1.0 - picture.coverage[..., None]
+        goal = image[..., :3] * image[..., 3:] + 1.0 - image[..., 3:]
+        errors.append(np.mean((over_white - goal) ** 2))
+    return float(-10.0 * np.log10(max(np.mean(errors), 1e-10)))

@@ -1,0 +1,93 @@
+"""Random worlds: five to ten obstacles around a robot, as MJCF files."""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax.core.types import Obstacle
+from vrrt_jax.core.verify import contacts
+from vrrt_jax.core.world import build_world, is_free
+from vrrt_jax.robots import Robot
+from vrrt_jax.robots.robot import workspace
+
+COUNT = (5, 10)  # obstacles, beside the floor
+KINDS = ("box", "sphere", "capsule", "cylinder")
+SIZE = (0.04, 0.10)  # [m] radii and half edges
+LENGTH = (0.10, 0.25)  # [m] half lengths of capsules and cylinders
+SHELL = (0.35, 0.95)  # distance of centres from the workspace's, in its radii
+COLOURS = ((0.30, 0.50, 0.75), (0.85, 0.65, 0.25), (0.85, 0.45, 0.30), (0.45, 0.65, 0.45))
+
+
+def random_world(robot: Robot, seed: int) -> list[Obstacle]:
+    """A floor and random obstacles within reach, none of which touches the robot at home."""
+    rng = np.random.default_rng(seed)
+    centre, radius = workspace(robot)
+    floor = Obstacle(
+        name="floor",
+        kind="plane",
+        position=(0.0, 0.0, -0.01),
+        size=(1.5, 1.5, 0.05),
+        rgba=(0.86, 0.87, 0.90, 1.0),
+    )
+    obstacles: list[Obstacle] = [floor]
+    num = int(rng.integers(COUNT[0], COUNT[1] + 1))
+    while len(obstacles) <= num:
+        obstacle = _random_obstacle(len(obstacles), centre, radius, rng)
+        world = build_world(robot, [*obstacles, obstacle])
+        at_home = bool(is_free(world, jnp.asarray(robot.home, jnp.float32)))
+        if (
+            obstacle.position[2] > 0.1
+            and at_home
+            and not contacts(robot, [*obstacles, obstacle], robot.home, geometry="spheres")
+        ):
+            obstacles.append(obstacle)
+    return obstacles
+
+
+def _random_obstacle(
+    index: int, centre: np.ndarray, radius: float, rng: np.random.Generator
+) -> Obstacle:
+    kind = KINDS[rng.integers(len(KINDS))]
+    direction = rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    position = centre + radius * rng.uniform(*SHELL) * direction
+    a, b, c = rng.uniform(*SIZE, 3)
+    size = {
+        "box": (a, b, c),
+        "sphere": (a, 0.0, 0.0),
+        "capsule": (0.6 * a, rng.uniform(*LENGTH), 0.0),
+        "cylinder": (0.6 * a, rng.uniform(*LENGTH), 0.0),
+    }[kind]
+    turn = rng.normal(size=4)
+    return Obstacle(
+        name=f"{kind}_{index}",
+        kind=kind,
+        position=_rounded(position),
+        quaternion=_rounded(turn / np.linalg.norm(turn)),
+        size=_rounded(size),
+        rgba=(*COLOURS[index % len(COLOURS)], 1.0),
+    )
+
+
+def _rounded(values: Sequence[float] | np.ndarray) -> tuple:
+    return tuple(round(float(value), 4) for value in values)
+
+
+def write_world(obstacles: Sequence[Obstacle], path: Path, comment: str = "") -> None:
+    """Write obstacles as an MJCF file for :func:`vrrt_jax.load_world`."""
+    root = ET.Element("mujoco", model=path.stem)
+    if comment:
+        root.append(ET.Comment(f" {comment} "))
+    body = ET.SubElement(root, "worldbody")
+    for obstacle in obstacles:
+        fields = {"pos": obstacle.position, "quat": obstacle.quaternion, "size": obstacle.size}
+        numbers = {key: " ".join(f"{v:g}" for v in value) for key, value in fields.items()}
+        colour = " ".join(f"{v:g}" for v in obstacle.rgba)
+        ET.SubElement(
+            body, "geom", {"name": obstacle.name, "type": obstacle.kind, **numbers, "rgba": colour}
+        )
+    ET.indent(root)
+    path.write_text(ET.tostring(root, encoding="unicode") + "\n")
