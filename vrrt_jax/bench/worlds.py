@@ -22,7 +22,11 @@ COLOURS = ((0.30, 0.50, 0.75), (0.85, 0.65, 0.25), (0.85, 0.45, 0.30), (0.45, 0.
 
 
 def random_world(robot: Robot, seed: int) -> list[Obstacle]:
-    """A floor and random obstacles within reach, none of which touches the robot at home."""
+    """A floor and random obstacles within reach, none of which touches the robot at home.
+
+    Raises:
+        ValueError: the robot touches itself or the floor at home.
+    """
     rng = np.random.default_rng(seed)
     centre, radius = workspace(robot)
     floor = Obstacle(
@@ -33,6 +37,11 @@ def random_world(robot: Robot, seed: int) -> list[Obstacle]:
         rgba=(0.86, 0.87, 0.90, 1.0),
     )
     obstacles: list[Obstacle] = [floor]
+    if touching := contacts(robot, obstacles, robot.home, geometry="spheres"):
+        raise ValueError(
+            f"the robot is in collision at home: {'; '.join(touching)}; expected a free keyframe "
+            "'home' in its file"
+        )
     num = int(rng.integers(COUNT[0], COUNT[1] + 1))
     while len(obstacles) <= num:
         obstacle = _random_obstacle(len(obstacles), centre, radius, rng)

@@ -4,9 +4,10 @@ import dataclasses
 
 import mujoco
 import numpy as np
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 STEP = 1e-4  # [m] centres and radii of fitted spheres are multiples of this
+_MANY_FACES = 400  # hulls with more are simplified, outwards
 _BLOCK = 10_000_000  # numbers in memory at once
 _ROUND = 20  # sides of the prism around a cylinder, 1.2 % wider; 2.5 % for other round shapes
 
@@ -29,14 +30,31 @@ class Piece:
 
 
 def piece_of(points: np.ndarray) -> Piece:
-    """The convex hull of points (n, 3) [m]."""
+    """The convex hull of points (n, 3) [m], or, of fine ones, a polytope just around it."""
     hull = ConvexHull(points)
+    if len(hull.simplices) > _MANY_FACES:
+        vertices = points[hull.vertices]
+        reach = np.max(vertices @ _DIRECTIONS.T, axis=0)
+        planes = np.column_stack([_DIRECTIONS, -reach])
+        hull = ConvexHull(HalfspaceIntersection(planes, vertices.mean(axis=0)).intersections)
     return Piece(
         vertices=hull.points,
         triangles=hull.simplices,
         normals=hull.equations[:, :3],
         offsets=-hull.equations[:, 3],
     )
+
+
+def _sphere_directions(num: int) -> np.ndarray:
+    """Unit vectors (num, 3), evenly spread on a spiral, and the six along the axes."""
+    height = 1.0 - (2.0 * np.arange(num) + 1.0) / num
+    angle = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(num)
+    radius = np.sqrt(1.0 - height**2)
+    spiral = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+    return np.vstack([spiral, np.eye(3), -np.eye(3)])
+
+
+_DIRECTIONS = _sphere_directions(200)
 
 
 def collision_pieces(model: mujoco.MjModel) -> dict[int, list[Piece]]:
