@@ -16,7 +16,7 @@ from vrrt_jax.cli import main
 from vrrt_jax.core.obstacles import load_obstacles
 from vrrt_jax.core.verify import contacts
 from vrrt_jax.core.world import obstacle_list
-from vrrt_jax.planner import visual_policy
+from vrrt_jax.sight import Sight, visual_policy
 
 ROBOTS = tasks.ROBOTS
 
@@ -210,7 +210,7 @@ def test_dr_robot_is_a_plain_adam_chain(near_task):
     found = baselines.dr_robot(
         robot, world, *inputs, near_task.q_start, config=baselines.ChainConfig(steps=12)
     )
-    policy, _, _ = visual_policy(robot, *inputs, near_task.q_start, vrrt_jax.PlannerConfig())
+    policy, _ = visual_policy(Sight(robot, *inputs), near_task.q_start, vrrt_jax.PlannerConfig())
     gradient = jax.jit(jax.grad(lambda q: policy.loss(world, q)))
     adam = optax.adam(0.04, b1=0.9, b2=0.9)
     q, path = jnp.asarray(near_task.q_start), []

@@ -18,7 +18,9 @@ from vrrt_jax.core import search as searches
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.rewire import with_costs
 from vrrt_jax.core.tree import UNREACHED, lineage
-from vrrt_jax.splat.loss import goal_loss
+from vrrt_jax.polish import polish
+from vrrt_jax.sight import Sight, visual_policy, visual_setup
+from vrrt_jax.splat.loss import goal_loss, weighted_goal, weighted_image
 from vrrt_jax.visual import plant
 
 Q_START = np.array([-0.9, 0.5, 0.0, -1.6, 0.0, 2.0, 0.8], np.float32)
@@ -38,8 +40,8 @@ def camera():
     return vrrt_jax.look_at((1.7, -1.2, 1.1), (0.1, 0.0, 0.4), height=96, width=128)
 
 
-def picture(panda, self_model, camera, q):
-    splats = self_model.levels[1].splats
+def picture(panda, self_model, camera, q, level=1):
+    splats = self_model.levels[level].splats
     poses = vrrt_jax.link_poses(panda.chain, jnp.asarray(q))
     rgb, coverage = jax.jit(vrrt_jax.render)(splats, poses, camera)
     straight = rgb / jnp.maximum(coverage, 1e-3)[..., None]
@@ -59,10 +61,9 @@ def open_world(panda):
 
 @pytest.fixture(scope="module")
 def policy(panda, self_model, camera, image):
-    found, probing, _ = planner.visual_policy(
-        panda, self_model, camera, image, Q_START, dataclasses.replace(SMALL, probes=0)
-    )
-    return found, probing
+    sight = Sight(panda, self_model, camera, image)
+    setup = visual_setup(sight, Q_START, dataclasses.replace(SMALL, probes=0))
+    return setup.policy, setup.probing
 
 
 def grown(world, policy, iterations, **changes):
@@ -155,7 +156,8 @@ def test_costs_stay_right_under_rewiring(policy, open_world):
 
 def test_probes_are_free_near_and_look_alike(panda, self_model, camera, image, wall_world, free):
     config = dataclasses.replace(SMALL, probe_steps=0)
-    visual, probing, _ = planner.visual_policy(panda, self_model, camera, image, Q_START, config)
+    setup = visual_setup(Sight(panda, self_model, camera, image), Q_START, config)
+    visual, probing = setup.policy, setup.probing
     q_roots = jnp.asarray(Q_START)[None]
     tree = jax.jit(plant, static_argnums=5)(
         wall_world, visual, probing, q_roots, jax.random.key(0), 512
@@ -250,12 +252,53 @@ def test_batch_equals_single_plans(panda, self_model, camera, image, open_world)
         np.testing.assert_allclose(batch[i].tree.q[:16], single.tree.q[:16], atol=1e-3)
 
 
+def test_weighted_images_make_the_loss(panda, self_model, camera, image, rng):
+    sight = Sight(
+        panda, self_model, [camera, camera], [image, image], [rng.random((96, 128)) < 0.8] * 2
+    )
+    policy, _ = visual_policy(sight, Q_START, SMALL)
+    q = jnp.asarray(Q_START)
+    args = (panda.chain, policy.splats, policy.cameras, policy.goal, q, policy.windows)
+    apart = jax.jit(weighted_image)(*args) - weighted_goal(policy.goal)
+    assert float(jnp.sum(apart**2)) == pytest.approx(float(goal_loss(*args)), rel=1e-4)
+
+
+def test_polishing_turns_the_wrist_back(panda, self_model, camera, open_world):
+    image = picture(panda, self_model, camera, Q_GOAL, level=2)
+    sight = Sight(panda, self_model, camera, image)
+    setup = visual_setup(sight, Q_START, planner.PlannerConfig(hypotheses=1, polish_kept=2))
+    assert setup.polishing is not None
+    polishing, goal_loss = setup.polishing
+    turned = Q_GOAL + np.array([0.02, 0, -0.02, 0, 0.05, 0.05, 0.9], np.float32)
+    q, loss = jax.jit(polish)(open_world, polishing, jnp.asarray(turned)[None], jax.random.key(0))
+    assert float(loss[0]) < goal_loss and float(loss[0]) <= float(loss[1])
+    assert np.abs(np.asarray(q[0]) - Q_GOAL).max() < 0.05
+    inside_ball = vrrt_jax.move_obstacle(
+        open_world, "ball", position=_hand_position(panda, Q_GOAL), size=(0.2, 0, 0)
+    )
+    _, loss = jax.jit(polish)(inside_ball, polishing, jnp.asarray(turned)[None], jax.random.key(0))
+    assert not np.isfinite(np.asarray(loss)).any()  # what matches is in collision
+
+
+def _hand_position(panda, q):
+    return np.asarray(vrrt_jax.link_poses(panda.chain, jnp.asarray(q)))[-1, :3, 3].tolist()
+
+
+def test_a_guess_becomes_a_root(panda, self_model, camera, image, open_world):
+    config = dataclasses.replace(SMALL, probes=0, max_iterations=3, hypotheses=0)
+    args = (panda, open_world, self_model, camera, image, Q_START)
+    told = vrrt_jax.plan(*args, key=jax.random.key(0), config=config, q_guess=Q_GOAL + 0.05)
+    np.testing.assert_allclose(told.tree.q[1], Q_GOAL + 0.05, atol=1e-6)
+    assert told.loss < vrrt_jax.plan(*args, key=jax.random.key(0), config=config).loss
+    with pytest.raises(ValueError, match="the guess is outside the limits: joint 'joint4'"):
+        vrrt_jax.plan(*args, key=jax.random.key(0), config=config, q_guess=np.zeros(7) + 1)
+
+
 def test_several_views_and_masks(panda, self_model, camera, image, open_world):
     second = vrrt_jax.look_at((-0.4, 1.9, 0.9), (0.1, 0.0, 0.4), height=96, width=128)
     images = [image, picture(panda, self_model, second, Q_GOAL)]
-    visual, _, _ = planner.visual_policy(
-        panda, self_model, [camera, second], images, Q_START, SMALL
-    )
+    sight = Sight(panda, self_model, [camera, second], images)
+    visual, _ = visual_policy(sight, Q_START, SMALL)
     assert visual.goal.rgb.shape[0] == 2
     at_goal, at_start = (
         float(goal_loss(panda.chain, visual.splats, visual.cameras, visual.goal, jnp.asarray(q)))

@@ -23,8 +23,9 @@ from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.edges import into_limits
 from vrrt_jax.core.types import pytree
 from vrrt_jax.core.world import World, is_free
-from vrrt_jax.planner import plan_to_configuration, visual_policy
+from vrrt_jax.planner import plan_to_configuration
 from vrrt_jax.robots.robot import Robot
+from vrrt_jax.sight import Sight, visual_policy
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera
 from vrrt_jax.visual import VisualPolicy
@@ -176,9 +177,8 @@ def dr_robot(
     """
     config = config or ChainConfig()
     q_start = checks.check_start(robot, world, q_start)
-    policy, _, goal_loss = visual_policy(
-        robot, self_model, camera, goal_image, q_start, PlannerConfig(), mask=mask
-    )
+    sight = Sight(robot, self_model, camera, goal_image, mask)
+    policy, goal_loss = visual_policy(sight, q_start, PlannerConfig())
     numbers = jnp.float32([config.alpha, config.beta1, config.beta2])
     run = functools.partial(_chain, world, policy, classifier, jnp.asarray(q_start), numbers)
     jax.block_until_ready(run(1))

@@ -32,6 +32,12 @@ class PlannerConfig:
     probe_steps: int = 60  # Adam steps that the kept ones take at that resolution
     probes_kept: int = 64  # best of them, which take those steps and become roots (re-compiles)
     probe_px: int = 32  # image height that they are rendered at (re-compiles)
+    hypotheses: int = 4  # matches that are polished on a larger image; 0 = none (re-compiles)
+    polish_lanes: int = 8  # samples of each, along what the image leaves open (re-compiles)
+    polish_px: int = 128  # height of that image (re-compiles)
+    polish_kept: int = 6  # best of all samples (re-compiles)
+    polish_steps: tuple[int, int] = (4, 8)  # Levenberg-Marquardt, of all and further of the best
+    polish_reach: float = 1.5  # how far the samples spread at most [rad]
     inherit: bool = True  # a child goes on with its parent's Adam moments
     rewiring: bool = True  # RRT*
     rewire_radius: float = 0.3  # [rad]
@@ -51,7 +57,8 @@ class PlannerConfig:
     @classmethod
     def paper(cls, **changes: Any) -> "PlannerConfig":
         """The published method (Visual-RRT, CVPR 2026): one tree, constant Adam steps."""
-        paper = {"probes": 0, "anneal": 0.0, "settle": 0, "min_improvement": 1e-4, "min_ratio": 1.0}
+        paper = {"probes": 0, "hypotheses": 0, "anneal": 0.0, "settle": 0}
+        paper |= {"min_improvement": 1e-4, "min_ratio": 1.0}
         return cls(**{**paper, **changes})
 
 

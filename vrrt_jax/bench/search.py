@@ -14,6 +14,7 @@ from vrrt_jax.core.expand import expand
 from vrrt_jax.core.search import make_stop, search
 from vrrt_jax.core.types import Expansion
 from vrrt_jax.problems import Problem, load_problem, problem_names
+from vrrt_jax.sight import Sight, visual_setup
 from vrrt_jax.visual import plant
 
 
@@ -29,17 +30,14 @@ def run(repeats: int = 15, seeds: int = 3) -> dict:
 def iteration_split(problem: Problem, repeats: int = 15) -> dict:
     """Times of the parts of one iteration on a grown tree, each jitted by itself [ms]."""
     config = planner.PlannerConfig()
-    policy, probing, _ = planner.visual_policy(
-        problem.robot,
-        problem.self_model,
-        problem.cameras,
-        problem.goal_images,
-        problem.q_start,
-        config,
-    )
+    sight = Sight(problem.robot, problem.self_model, problem.cameras, problem.goal_images)
+    setup = visual_setup(sight, problem.q_start, config)
+    policy = setup.policy
     world, key = problem.world, jax.random.key(0)
     q_start = jnp.asarray(problem.q_start)[None]
-    tree = jax.jit(plant, static_argnums=5)(world, policy, probing, q_start, key, config.capacity)
+    tree = jax.jit(plant, static_argnums=5)(
+        world, policy, setup.probing, q_start, key, config.capacity
+    )
     found = search(
         world, policy, tree, key=key, stop=make_stop(-1.0, max_iterations=40), time_limit_s=60.0
     )

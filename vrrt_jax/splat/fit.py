@@ -56,6 +56,7 @@ class FitConfig:
     levels: tuple[LevelConfig, ...] = (
         LevelConfig(num_splats=300, size_px=32, steps=1000, batch=8),
         LevelConfig(num_splats=600, size_px=64, steps=1500, batch=6),
+        LevelConfig(num_splats=1500, size_px=128, steps=600, batch=4),
         LevelConfig(num_splats=5000, size_px=256, steps=300, batch=2),
     )
 

@@ -40,6 +40,39 @@ def goal_loss(
     return jnp.mean(jnp.stack(losses))
 
 
+def weighted_image(
+    chain: Chain,
+    splats: SplatModel,
+    cameras: Camera,
+    goal: GoalImage,
+    q: jax.Array,
+    windows: Windows | None = None,
+) -> jax.Array:
+    """The image of a configuration (D,) as a vector (V * H * W * 4,).
+
+    Its squared distance from :func:`weighted_goal` is the :func:`goal_loss`.
+    """
+    poses = link_poses(chain, q)
+    views = []
+    for view in range(goal.rgb.shape[0]):
+        camera = jax.tree.map(lambda leaf: leaf[view], cameras)  # noqa: B023 - used at once
+        rgb, coverage = render(splats, poses, camera, windows)
+        views.append(jnp.concatenate([rgb, coverage[..., None]], axis=-1))
+    return (jnp.stack(views) * _root_weight(goal)).ravel()
+
+
+def weighted_goal(goal: GoalImage) -> jax.Array:
+    """The goal as a vector (V * H * W * 4,), see :func:`weighted_image`."""
+    image = jnp.concatenate([goal.rgb, goal.coverage[..., None]], axis=-1)
+    return (image * _root_weight(goal)).ravel()
+
+
+def _root_weight(goal: GoalImage) -> jax.Array:
+    """(V, H, W, 1), whose squares are what a pixel counts in the mean over views."""
+    num_valid = jnp.maximum(jnp.sum(goal.valid, axis=(1, 2), keepdims=True), 1.0)
+    return jnp.sqrt(goal.valid / (4.0 * num_valid * len(goal.valid)))[..., None]
+
+
 def psnr_db(mean_squared_error: float) -> float:
     """Peak signal-to-noise ratio of images in [0, 1] [dB]."""
     return float(-10.0 * jnp.log10(mean_squared_error))

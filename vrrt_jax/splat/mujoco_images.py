@@ -82,7 +82,7 @@ class MeshRenderer:
             renderer.enable_segmentation_rendering()
             segments = renderer.render()
             renderer.disable_segmentation_rendering()
-        is_geom = segments[..., 1] == mujoco.mjtObj.mjOBJ_GEOM
+        is_geom = segments[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)
         group = np.append(self.model.geom_group, -1)[np.where(is_geom, segments[..., 0], -1)]
         mask = is_geom & (group != OBSTACLE_GROUP)
         return Picture(
@@ -103,7 +103,7 @@ class MeshRenderer:
         renderer.enable_segmentation_rendering()
         segments = renderer.render()
         renderer.disable_segmentation_rendering()
-        is_geom = segments[..., 1] == mujoco.mjtObj.mjOBJ_GEOM
+        is_geom = segments[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)
         return depth, np.where(is_geom, segments[..., 0], -1)
 
     def scene(self, q: np.ndarray, camera: Camera) -> np.ndarray:

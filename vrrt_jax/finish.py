@@ -1,0 +1,223 @@
+"""From a grown tree to a verified path."""
+
+import dataclasses
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax.config import PlannerConfig, PlanResult
+from vrrt_jax.core import tree as trees
+from vrrt_jax.core.rrt import RRTConnect, connection_path, tree_path
+from vrrt_jax.core.search import SearchResult, Stopped, make_stop, search
+from vrrt_jax.core.shortcut import path_length, shortcut
+from vrrt_jax.core.types import Rejection, Status
+from vrrt_jax.core.verify import verify_path
+from vrrt_jax.core.world import World, obstacle_list
+from vrrt_jax.polish import Polishing, polish
+from vrrt_jax.robots.robot import Robot
+
+STATUS_OF = {
+    Stopped.CONVERGED: Status.NO_MATCH,
+    Stopped.ITERATIONS: Status.BUDGET,
+    Stopped.TREE_FULL: Status.TREE_FULL,
+    Stopped.TIME_LIMIT: Status.TIME_LIMIT,
+    Stopped.INTERRUPTED: Status.INTERRUPTED,
+}
+TRIED = 3  # matched configurations that are tried before there is no path
+DISTINCT = 0.3  # [rad] distance at which they count as different
+SAME_LOSS = 1.05  # losses within this factor are the same match
+
+_polish = jax.jit(polish)
+
+
+def finish_visual(
+    robot: Robot,
+    world: World,
+    found: SearchResult,
+    goal_loss: float,
+    polishing: tuple[Polishing, float] | None,
+    q_start: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+) -> PlanResult:
+    """Choose where to end, find a way there, shorten and verify it.
+
+    Args:
+        robot: whose path it is.
+        world: robot and obstacles.
+        found: the search.
+        goal_loss: that counts as matched in it.
+        polishing: how to look at matches more closely, and the loss that counts there.
+        q_start: (D,).
+        key: random key.
+        config: settings.
+    """
+    score, q = np.asarray(found.tree.score), np.asarray(found.tree.q)
+    if polishing is not None and found.stopped not in (Stopped.TIME_LIMIT, Stopped.INTERRUPTED):
+        settings, fine_goal_loss = polishing
+        nodes = list(_distinct(world, score, q, q_start, config.hypotheses, np.inf))
+        chosen = q[np.resize(nodes, config.hypotheses)]
+        found, (q_fine, loss_fine) = _clocked(found, _polish, world, settings, chosen, key)
+        if loss_fine.min() <= fine_goal_loss:
+            ends = _distinct(world, loss_fine, q_fine, q_start, TRIED, fine_goal_loss)
+            for best in ends:
+                found, path = _connected(world, found, q_start, q_fine[best], key, config)
+                if path is not None:
+                    break
+            else:
+                best, path = int(np.argmin(loss_fine)), None
+            end = q_fine[best], float(loss_fine[best]), fine_goal_loss
+            return finish(robot, world, found, path, *end, key, config, q_start)
+
+    if score.min() > goal_loss:  # nothing matches: the best that a path leads to
+        score = np.where(np.asarray(found.tree.cost) < trees.UNREACHED, score, np.inf)
+    for best in _distinct(world, score, q, q_start, TRIED, goal_loss):
+        path = tree_path(found.tree, best)
+        if np.array_equal(path[0], q_start) or score[best] > goal_loss:
+            break
+        found, path = _connected(world, found, q_start, q[best], key, config)
+        if path is not None:
+            break
+    else:
+        best, path = int(np.argmin(score)), None
+    end = q[best], float(score[best]), goal_loss
+    return finish(robot, world, found, path, *end, key, config, q_start)
+
+
+def _distinct(
+    world: World,
+    score: np.ndarray,
+    q: np.ndarray,
+    q_start: np.ndarray,
+    most: int,
+    goal_loss: float,
+) -> Iterator[int]:
+    """Where to end: as good as the best, nearest to the start first; then other matches."""
+    wraps = np.asarray(world.wraps)
+
+    def apart(nodes: np.ndarray, q_other: np.ndarray) -> np.ndarray:
+        step = q[nodes] - q_other
+        return np.linalg.norm(step - 2 * np.pi * np.round(step / (2 * np.pi)) * wraps, axis=1)
+
+    open_nodes = np.flatnonzero(np.isfinite(score) & (score <= max(goal_loss, score.min())))
+    for _ in range(most):
+        if len(open_nodes) == 0:
+            return
+        # Nodes just under the bar would be nearer still, but only as they are not there yet.
+        equal = open_nodes[score[open_nodes] <= SAME_LOSS * score[open_nodes].min()]
+        best = int(equal[np.argmin(apart(equal, q_start))])
+        yield best
+        open_nodes = open_nodes[apart(open_nodes, q[best]) > DISTINCT]
+
+
+def _connected(
+    world: World,
+    found: SearchResult,
+    q_start: np.ndarray,
+    q_goal: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+) -> tuple[SearchResult, np.ndarray | None]:
+    """A path (P, D) by RRT-Connect, if there is one; its time is added to the search's."""
+    policy = RRTConnect(lanes=config.lanes)
+    tree = policy.forest(jnp.asarray(q_start), jnp.asarray(q_goal), config.capacity)
+    stop = make_stop(0.0, max_iterations=config.connect_iterations)
+    connection = search(world, policy, tree, key=key, stop=stop, time_limit_s=config.time_limit_s)
+    found = dataclasses.replace(
+        found,
+        compile_s=found.compile_s + connection.compile_s,
+        search_s=found.search_s + connection.search_s,
+    )
+    return found, connection_path(connection.tree)
+
+
+def _clocked(found: SearchResult, function: Any, *args: Any) -> tuple[SearchResult, Any]:
+    """Call a jitted function; its time is added to the search's, compilation apart."""
+    result, compile_s, run_s = timed(function, *args)
+    found = dataclasses.replace(
+        found, compile_s=found.compile_s + compile_s, search_s=found.search_s + run_s
+    )
+    return found, jax.device_get(result)
+
+
+def timed(function: Any, *args: Any) -> tuple[Any, float, float]:
+    """The result of a jitted function, and the seconds of its compilation, if any, and its run."""
+
+    def run() -> tuple[Any, float]:
+        started = time.perf_counter()
+        result = jax.block_until_ready(function(*args))
+        return result, time.perf_counter() - started
+
+    programs = function._cache_size()
+    result, first_s = run()
+    if function._cache_size() == programs:
+        return result, 0.0, first_s
+    result, run_s = run()
+    return result, first_s - run_s, run_s
+
+
+def finish(
+    robot: Robot,
+    world: World,
+    found: SearchResult,
+    raw_path: np.ndarray | None,
+    target: np.ndarray,
+    loss: float,
+    goal_loss: float,
+    key: jax.Array,
+    config: PlannerConfig,
+    q_start: np.ndarray,
+) -> PlanResult:
+    """Shorten and verify; if the shortened path fails the exact check, fall back on the raw one.
+
+    Without a path the result is the start alone.
+    """
+    has_path = raw_path is not None
+    raw_path = q_start[None] if raw_path is None else raw_path
+    started = time.perf_counter()
+    shortcut(world, raw_path, key=key, rounds=0)
+    shortcut_compile_s = time.perf_counter() - started
+    started = time.perf_counter()
+    path = shortcut(world, raw_path, key=key, rounds=config.shortcut_rounds)
+    shortcut_s = time.perf_counter() - started
+
+    started = time.perf_counter()
+    obstacles = obstacle_list(world)
+    verification = verify_path(robot, obstacles, path, step=config.verify_step)
+    if not verification.ok:
+        raw = verify_path(robot, obstacles, raw_path, step=config.verify_step)
+        if raw.ok:
+            path, verification = raw_path, raw
+    verify_s = time.perf_counter() - started
+
+    if not has_path:
+        status = Status.NO_PATH
+    elif loss > goal_loss:
+        status = STATUS_OF.get(found.stopped, Status.NO_MATCH)
+    else:
+        status = Status.SOLVED if verification.ok else Status.NOT_VERIFIED
+    rejected = np.asarray(found.tree.rejected)
+    return PlanResult(
+        status=status,
+        path=path,
+        raw_path=raw_path,
+        target=target,
+        loss=loss,
+        goal_loss=goal_loss,
+        cost=path_length(world, path),
+        verification=verification,
+        rejected={reason.name.lower(): int(rejected[reason]) for reason in Rejection},
+        iterations=int(found.tree.iteration),
+        timing={
+            "compile_s": found.compile_s + shortcut_compile_s,
+            "search_s": found.search_s,
+            "shortcut_s": shortcut_s,
+            "verify_s": verify_s,
+        },
+        history=found.history,
+        tree=found.tree,
+    )

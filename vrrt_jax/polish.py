@@ -1,0 +1,124 @@
+"""Tell apart what a small image cannot: matched configurations, looked at more closely.
+
+At the resolution of the search some directions are open: a wrist may turn by a radian and the image
+hardly changes. Near a match these are the weak eigenvectors of the Gauss-Newton matrix. Polishing
+spreads samples along them and lets all descend by Levenberg-Marquardt on a larger image with more
+splats. With few joints that takes forward renders alone.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from vrrt_jax.core.edges import into_limits
+from vrrt_jax.core.types import pytree, static
+from vrrt_jax.core.world import World, is_free
+from vrrt_jax.splat.loss import weighted_goal, weighted_image
+from vrrt_jax.splat.raster import map_lanes
+from vrrt_jax.visual import VisualPolicy
+
+PROBE = 0.01  # [rad] step of the finite differences
+OTHERS = 0.5  # standard deviations that samples spread along all but the weakest direction
+RIDGE = 1e-7  # keeps joints that no pixel sees where they are
+LONGEST = 0.3  # [rad] of one step of a joint
+
+
+@pytree
+class Polishing:
+    """How configurations are polished."""
+
+    policy: VisualPolicy  # with the larger goal; only its loss is used
+    slack: jax.Array  # () how much loss the spread may add, to second order
+    reach: jax.Array  # () how far samples spread at most [rad]
+    steps: jax.Array  # (2,) i32 of all samples, and further ones of the best
+    lanes: int = static()  # samples of each configuration, itself among them
+    kept: int = static()  # the best of all samples
+
+
+@pytree
+class _Descent:
+    """Levenberg-Marquardt from n configurations at once."""
+
+    q: jax.Array  # (n, D)
+    loss: jax.Array  # (n,)
+    residual: jax.Array  # (n, pixels)
+    jacobian: jax.Array  # (n, D, pixels)
+    damping: jax.Array  # (n,)
+
+
+def polish(
+    world: World, polishing: Polishing, q: jax.Array, key: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Spread configurations (H, D) and descend.
+
+    Returns:
+        Configurations (kept, D), best first, and their losses; infinite in collision.
+    """
+    near = _begin(world, polishing.policy, q)
+    samples = _begin(world, polishing.policy, _spread(world, polishing, near, key))
+    samples = _descend(world, polishing.policy, samples, polishing.steps[0])
+    _, best = jax.lax.top_k(-samples.loss, polishing.kept)
+    kept = jax.tree.map(lambda leaf: leaf[best], samples)
+    kept = _descend(world, polishing.policy, kept, polishing.steps[1])
+    free = jax.vmap(is_free, (None, 0))(world, kept.q)
+    loss = jnp.where(free, kept.loss, jnp.inf)
+    order = jnp.argsort(loss)
+    return kept.q[order], loss[order]
+
+
+def _spread(world: World, polishing: Polishing, near: _Descent, key: jax.Array) -> jax.Array:
+    """Samples (H * lanes, D) along the directions that the image tells little about."""
+    curvature = 2.0 * jnp.einsum("hip,hjp->hij", near.jacobian, near.jacobian)
+    values, vectors = jnp.linalg.eigh(curvature)
+    reach = jnp.sqrt(2.0 * polishing.slack / jnp.maximum(values, 1e-9))
+    reach = jnp.minimum(reach, polishing.reach)[:, None]
+    num, joints = polishing.lanes - 1, near.q.shape[1]
+    along = OTHERS * jax.random.normal(key, (len(near.q), num, joints))
+    along = along.at[:, :, 0].set(jnp.linspace(-1.0, 1.0, num))  # eigenvalues rise
+    samples = near.q[:, None] + jnp.einsum("hij,hlj->hli", vectors, reach * along)
+    samples = jnp.concatenate([near.q[:, None], samples], axis=1)
+    return into_limits(world, samples.reshape(-1, joints))
+
+
+def _begin(world: World, policy: VisualPolicy, q: jax.Array) -> _Descent:
+    """Images at configurations (n, D), and their derivatives by finite differences."""
+    joints = q.shape[1]
+    places = q[:, None] + PROBE * jnp.eye(joints + 1, joints, -1)
+
+    def image(q):
+        return weighted_image(
+            world.chain, policy.splats, policy.cameras, policy.goal, q, policy.windows
+        )
+
+    images = map_lanes(image, places.reshape(-1, joints)).reshape(len(q), joints + 1, -1)
+    residual = images[:, 0] - weighted_goal(policy.goal)
+    return _Descent(
+        q=q,
+        loss=jnp.sum(residual**2, axis=1),
+        residual=residual,
+        jacobian=(images[:, 1:] - images[:, :1]) / PROBE,
+        damping=jnp.full(len(q), 1e-2),
+    )
+
+
+def _descend(world: World, policy: VisualPolicy, start: _Descent, steps: jax.Array) -> _Descent:
+    """Steps that lower the loss; those that do not raise the damping."""
+
+    def step(_, now: _Descent) -> _Descent:
+        matrix = jnp.einsum("nip,njp->nij", now.jacobian, now.jacobian)
+        slope = jnp.einsum("nip,np->ni", now.jacobian, now.residual)
+        diagonal = jnp.einsum("nii->ni", matrix)
+        matrix += jax.vmap(jnp.diag)(now.damping[:, None] * diagonal + RIDGE)
+        change = -jnp.linalg.solve(matrix, slope[..., None])[..., 0]
+        q = into_limits(world, now.q + jnp.clip(change, -LONGEST, LONGEST))
+        tried = _begin(world, policy, q)
+        better = tried.loss < now.loss
+        damping = now.damping * jnp.where(better, 0.3, 4.0)
+
+        def choose(new: jax.Array, old: jax.Array) -> jax.Array:
+            return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+        return dataclasses.replace(jax.tree.map(choose, tried, now), damping=damping)
+
+    return jax.lax.fori_loop(0, steps, step, start)
