@@ -9,10 +9,10 @@ import pytest
 from vrrt_jax.robots import cover, fit, load_robot, pieces, sources, spheres
 from vrrt_jax.robots.measure import measure_spheres
 
-# Bounds on the packaged Panda, with the worst of five seeds at 10,000 configurations beside them.
-OBSTACLE_FALSE_ALARMS = 0.05  # 0.034
-SELF_FALSE_ALARMS = 0.02  # 0.017
-SELF_MISSES = 0.01  # 0.002
+# Bounds on false alarms, against obstacles and itself; measured at 10,000 configurations, seed 0:
+# 2.7 and 1.6 %, 4.7 and 5.0 %, 1.0 and 4.0 %.
+FALSE_ALARMS = {"panda": (0.05, 0.02), "ur5e": (0.06, 0.06), "fetch": (0.02, 0.05)}
+SELF_MISSES = 0.01  # 0.002, 0.001, 0.005
 
 ARM = """
 <mujoco model="arm">
@@ -70,15 +70,19 @@ def uncovered(model, bodies, robot, rng):
     return worst
 
 
-@pytest.mark.parametrize("seed", [11, 12])
-def test_panda_spheres_miss_nothing_and_rarely_cry_wolf(panda, panda_meshes, seed):
-    report = measure_spheres(panda, num=2500, seed=seed)
-    assert report.obstacles.colliding > 300
+@pytest.mark.parametrize("name", FALSE_ALARMS)
+def test_spheres_miss_nothing_and_rarely_cry_wolf(name):
+    robot = load_robot(name)
+    if sources.mesh_file(robot.mesh_source) is None:
+        pytest.skip(f"the meshes of {name} are not installed")
+    report = measure_spheres(robot, num=2500, seed=11)
+    assert report.obstacles.colliding > 150
     assert report.obstacles.misses == 0
-    # with 20 scenes of 125 configurations each, the share varies by a third between seeds
-    assert report.obstacles.false_alarm_rate < OBSTACLE_FALSE_ALARMS
+    for counts, bound in zip(
+        (report.obstacles, report.self_collision), FALSE_ALARMS[name], strict=True
+    ):
+        assert counts.false_alarm_rate < bound
     assert report.self_collision.miss_rate < SELF_MISSES
-    assert report.self_collision.false_alarm_rate < SELF_FALSE_ALARMS
 
 
 def test_panda_spheres_contain_the_whole_surface(panda, panda_meshes, rng):

@@ -29,15 +29,21 @@ def goal_loss(
     windows: Windows | None = None,
 ) -> jax.Array:
     """Loss () of a configuration (D,): the mean over the V views."""
-    poses = link_poses(chain, q)
-    losses = []
-    for view in range(goal.rgb.shape[0]):
-        camera = jax.tree.map(lambda leaf: leaf[view], cameras)  # noqa: B023 - used at once
-        rgb, coverage = render(splats, poses, camera, windows)
-        losses.append(
-            image_loss(rgb, coverage, goal.rgb[view], goal.coverage[view], goal.valid[view])
-        )
+    views = _views(chain, splats, cameras, q, windows)
+    losses = [
+        image_loss(rgb, coverage, goal.rgb[view], goal.coverage[view], goal.valid[view])
+        for view, (rgb, coverage) in enumerate(views)
+    ]
     return jnp.mean(jnp.stack(losses))
+
+
+def _views(
+    chain: Chain, splats: SplatModel, cameras: Camera, q: jax.Array, windows: Windows | None
+) -> list[tuple[jax.Array, jax.Array]]:
+    """Colour and coverage in each of the V views."""
+    poses = link_poses(chain, q)
+    each = [jax.tree.map(lambda leaf: leaf[v], cameras) for v in range(len(cameras.focal))]  # noqa: B023
+    return [render(splats, poses, camera, windows) for camera in each]
 
 
 def weighted_image(
@@ -52,12 +58,10 @@ def weighted_image(
 
     Its squared distance from :func:`weighted_goal` is the :func:`goal_loss`.
     """
-    poses = link_poses(chain, q)
-    views = []
-    for view in range(goal.rgb.shape[0]):
-        camera = jax.tree.map(lambda leaf: leaf[view], cameras)  # noqa: B023 - used at once
-        rgb, coverage = render(splats, poses, camera, windows)
-        views.append(jnp.concatenate([rgb, coverage[..., None]], axis=-1))
+    views = [
+        jnp.concatenate([rgb, coverage[..., None]], axis=-1)
+        for rgb, coverage in _views(chain, splats, cameras, q, windows)
+    ]
     return (jnp.stack(views) * _root_weight(goal)).ravel()
 
 
