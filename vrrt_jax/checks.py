@@ -39,7 +39,7 @@ RANGES = {
     "probe_radius": (0.0, np.inf),
     "probe_px": (8, 4096),
     "hypotheses": (0, 1024),
-    "polish_lanes": (2, 1024),
+    "polish_lanes": (3, 1024),
     "polish_px": (8, 4096),
     "polish_kept": (1, 1024),
     "polish_reach": (0.0, np.inf),

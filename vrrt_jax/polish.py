@@ -32,7 +32,7 @@ class Polishing:
     slack: jax.Array  # () how much loss the spread may add, to second order
     reach: jax.Array  # () how far samples spread at most [rad]
     steps: jax.Array  # (2,) i32 of all samples, and further ones of the best
-    lanes: int = static()  # samples of each configuration, itself among them
+    lanes: int = static()  # samples of each configuration, itself and half a turn among them
     kept: int = static()  # the best of all samples
 
 
@@ -73,11 +73,15 @@ def _spread(world: World, polishing: Polishing, near: _Descent, key: jax.Array) 
     values, vectors = jnp.linalg.eigh(curvature)
     reach = jnp.sqrt(2.0 * polishing.slack / jnp.maximum(values, 1e-9))
     reach = jnp.minimum(reach, polishing.reach)[:, None]
-    num, joints = polishing.lanes - 1, near.q.shape[1]
+    num, joints = polishing.lanes - 2, near.q.shape[1]
     along = OTHERS * jax.random.normal(key, (len(near.q), num, joints))
     along = along.at[:, :, 0].set(jnp.linspace(-1.0, 1.0, num))  # eigenvalues rise
     samples = near.q[:, None] + jnp.einsum("hij,hlj->hli", vectors, reach * along)
-    samples = jnp.concatenate([near.q[:, None], samples], axis=1)
+    # Grippers look alike after half a turn.
+    weakest = vectors[:, :, 0]
+    away_from_centre = jnp.sum(near.q * weakest, axis=1, keepdims=True) > 0
+    turned = near.q + jnp.where(away_from_centre, -jnp.pi, jnp.pi) * weakest
+    samples = jnp.concatenate([near.q[:, None], turned[:, None], samples], axis=1)
     return into_limits(world, samples.reshape(-1, joints))
 
 
