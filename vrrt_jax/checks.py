@@ -43,6 +43,7 @@ RANGES = {
     "polish_px": (8, 4096),
     "polish_kept": (1, 1024),
     "polish_reach": (0.0, np.inf),
+    "start_prior": (0.0, np.inf),
     "probe_alpha": (0.0, 1.0),
     "probe_steps": (0, 100_000),
     "lanes": (1, 4096),

@@ -38,6 +38,7 @@ class PlannerConfig:
     polish_kept: int = 6  # best of all samples (re-compiles)
     polish_steps: tuple[int, int] = (4, 8)  # Levenberg-Marquardt, of all and further of the best
     polish_reach: float = 1.5  # how far the samples spread at most [rad]
+    start_prior: float = 0.005  # goal losses that a radian from the start costs there
     inherit: bool = True  # a child goes on with its parent's Adam moments
     rewiring: bool = True  # RRT*
     rewire_radius: float = 0.3  # [rad]
@@ -48,7 +49,7 @@ class PlannerConfig:
     min_ratio: float = 0.97  # ... and below this share of the one before
     time_limit_s: float = float("inf")  # of the search, compilation excluded [s]
     connect_iterations: int = 200  # of RRT-Connect, to a match that the tree has not reached
-    shortcut_rounds: int = 60
+    shortcut_rounds: int = 150
     verify_step: float = 0.005  # [rad]
     lanes: int = 32  # expansions an iteration (re-compiles)
     capacity: int = 8192  # nodes (re-compiles)

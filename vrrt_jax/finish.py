@@ -62,14 +62,13 @@ def finish_visual(
         nodes = list(_distinct(world, score, q, q_start, config.hypotheses, np.inf))
         chosen = q[np.resize(nodes, config.hypotheses)]
         found, (q_fine, loss_fine) = _clocked(found, _polish, world, settings, chosen, key)
-        if loss_fine.min() <= fine_goal_loss:
-            ends = _distinct(world, loss_fine, q_fine, q_start, TRIED, fine_goal_loss)
-            for best in ends:
+        matches = np.flatnonzero(loss_fine <= fine_goal_loss)  # best first
+        if len(matches):
+            best, path = matches[0], None
+            for best in matches[:TRIED]:
                 found, path = _connected(world, found, q_start, q_fine[best], key, config)
                 if path is not None:
                     break
-            else:
-                best, path = int(np.argmin(loss_fine)), None
             end = q_fine[best], float(loss_fine[best]), fine_goal_loss
             return finish(robot, world, found, path, *end, key, config, q_start)
 

@@ -3,7 +3,8 @@
 At the resolution of the search some directions are open: a wrist may turn by a radian and the image
 hardly changes. Near a match these are the weak eigenvectors of the Gauss-Newton matrix. Polishing
 spreads samples along them and lets all descend by Levenberg-Marquardt on a larger image with more
-splats. With few joints that takes forward renders alone.
+splats. With few joints that takes forward renders alone. What no image tells, such as the turn of a
+bare flange, stays near the start: a weak prior sees to that.
 """
 
 import dataclasses
@@ -11,7 +12,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from vrrt_jax.core.edges import into_limits
+from vrrt_jax.core.edges import difference, into_limits
 from vrrt_jax.core.types import pytree, static
 from vrrt_jax.core.world import World, is_free
 from vrrt_jax.splat.loss import weighted_goal, weighted_image
@@ -29,6 +30,8 @@ class Polishing:
     """How configurations are polished."""
 
     policy: VisualPolicy  # with the larger goal; only its loss is used
+    q_start: jax.Array  # (D,)
+    prior: jax.Array  # () loss that a radian away from the start costs
     slack: jax.Array  # () how much loss the spread may add, to second order
     reach: jax.Array  # () how far samples spread at most [rad]
     steps: jax.Array  # (2,) i32 of all samples, and further ones of the best
@@ -41,9 +44,10 @@ class _Descent:
     """Levenberg-Marquardt from n configurations at once."""
 
     q: jax.Array  # (n, D)
-    loss: jax.Array  # (n,)
-    residual: jax.Array  # (n, pixels)
-    jacobian: jax.Array  # (n, D, pixels)
+    loss: jax.Array  # (n,) of the image alone
+    cost: jax.Array  # (n,) and with the prior
+    residual: jax.Array  # (n, pixels + D)
+    jacobian: jax.Array  # (n, D, pixels + D)
     damping: jax.Array  # (n,)
 
 
@@ -53,18 +57,17 @@ def polish(
     """Spread configurations (H, D) and descend.
 
     Returns:
-        Configurations (kept, D), best first, and their losses; infinite in collision.
+        Configurations (kept, D), best first, and their image losses; infinite in collision.
     """
-    near = _begin(world, polishing.policy, q)
-    samples = _begin(world, polishing.policy, _spread(world, polishing, near, key))
-    samples = _descend(world, polishing.policy, samples, polishing.steps[0])
-    _, best = jax.lax.top_k(-samples.loss, polishing.kept)
+    near = _begin(world, polishing, q)
+    samples = _begin(world, polishing, _spread(world, polishing, near, key))
+    samples = _descend(world, polishing, samples, polishing.steps[0])
+    _, best = jax.lax.top_k(-samples.cost, polishing.kept)
     kept = jax.tree.map(lambda leaf: leaf[best], samples)
-    kept = _descend(world, polishing.policy, kept, polishing.steps[1])
+    kept = _descend(world, polishing, kept, polishing.steps[1])
     free = jax.vmap(is_free, (None, 0))(world, kept.q)
-    loss = jnp.where(free, kept.loss, jnp.inf)
-    order = jnp.argsort(loss)
-    return kept.q[order], loss[order]
+    order = jnp.argsort(jnp.where(free, kept.cost, jnp.inf))
+    return kept.q[order], jnp.where(free, kept.loss, jnp.inf)[order]
 
 
 def _spread(world: World, polishing: Polishing, near: _Descent, key: jax.Array) -> jax.Array:
@@ -85,9 +88,9 @@ def _spread(world: World, polishing: Polishing, near: _Descent, key: jax.Array) 
     return into_limits(world, samples.reshape(-1, joints))
 
 
-def _begin(world: World, policy: VisualPolicy, q: jax.Array) -> _Descent:
+def _begin(world: World, polishing: Polishing, q: jax.Array) -> _Descent:
     """Images at configurations (n, D), and their derivatives by finite differences."""
-    joints = q.shape[1]
+    policy, joints = polishing.policy, q.shape[1]
     places = q[:, None] + PROBE * jnp.eye(joints + 1, joints, -1)
 
     def image(q):
@@ -97,17 +100,23 @@ def _begin(world: World, policy: VisualPolicy, q: jax.Array) -> _Descent:
 
     images = map_lanes(image, places.reshape(-1, joints)).reshape(len(q), joints + 1, -1)
     residual = images[:, 0] - weighted_goal(policy.goal)
+    loss = jnp.sum(residual**2, axis=1)
+    root = jnp.sqrt(polishing.prior)
+    away = root * difference(world, polishing.q_start, q)
+    outwards = jnp.broadcast_to(root * jnp.eye(joints), (len(q), joints, joints))
+    slopes = (images[:, 1:] - images[:, :1]) / PROBE
     return _Descent(
         q=q,
-        loss=jnp.sum(residual**2, axis=1),
-        residual=residual,
-        jacobian=(images[:, 1:] - images[:, :1]) / PROBE,
+        loss=loss,
+        cost=loss + jnp.sum(away**2, axis=1),
+        residual=jnp.concatenate([residual, away], axis=1),
+        jacobian=jnp.concatenate([slopes, outwards], axis=2),
         damping=jnp.full(len(q), 1e-2),
     )
 
 
-def _descend(world: World, policy: VisualPolicy, start: _Descent, steps: jax.Array) -> _Descent:
-    """Steps that lower the loss; those that do not raise the damping."""
+def _descend(world: World, polishing: Polishing, start: _Descent, steps: jax.Array) -> _Descent:
+    """Steps that lower the cost; those that do not raise the damping."""
 
     def step(_, now: _Descent) -> _Descent:
         matrix = jnp.einsum("nip,njp->nij", now.jacobian, now.jacobian)
@@ -116,8 +125,8 @@ def _descend(world: World, policy: VisualPolicy, start: _Descent, steps: jax.Arr
         matrix += jax.vmap(jnp.diag)(now.damping[:, None] * diagonal + RIDGE)
         change = -jnp.linalg.solve(matrix, slope[..., None])[..., 0]
         q = into_limits(world, now.q + jnp.clip(change, -LONGEST, LONGEST))
-        tried = _begin(world, policy, q)
-        better = tried.loss < now.loss
+        tried = _begin(world, polishing, q)
+        better = tried.cost < now.cost
         damping = now.damping * jnp.where(better, 0.3, 4.0)
 
         def choose(new: jax.Array, old: jax.Array) -> jax.Array:

@@ -76,7 +76,7 @@ def visual_setup(sight: Sight, q_start: np.ndarray, config: PlannerConfig) -> Se
         policy=policy,
         goal_loss=goal_loss,
         probing=visual_probing(sight, policy, config),
-        polishing=visual_polishing(sight, policy, config) if config.hypotheses else None,
+        polishing=visual_polishing(sight, policy, q_start, config) if config.hypotheses else None,
     )
 
 
@@ -121,12 +121,14 @@ def visual_probing(sight: Sight, policy: VisualPolicy, config: PlannerConfig) ->
 
 
 def visual_polishing(
-    sight: Sight, policy: VisualPolicy, config: PlannerConfig
+    sight: Sight, policy: VisualPolicy, q_start: np.ndarray, config: PlannerConfig
 ) -> tuple[Polishing, float]:
     """How matches are looked at after it, and the loss that counts as matched there."""
     fields, goal_loss = sight.at(config.polish_px, config.match_scale)
     polishing = Polishing(
         policy=dataclasses.replace(policy, **fields),
+        q_start=jnp.asarray(q_start),
+        prior=jnp.float32(config.start_prior * goal_loss),
         slack=jnp.float32(POLISH_SLACK * goal_loss),
         reach=jnp.float32(config.polish_reach),
         steps=jnp.asarray(config.polish_steps, jnp.int32),

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import distance
+from vrrt_jax.core.edges import difference, distance
 from vrrt_jax.core.rewire import rewire
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
 from vrrt_jax.core.world import World
@@ -95,6 +95,7 @@ class RRTConnect:
     A node that arrives scores 0.
     """
 
+    margin: float = 1.0  # how far from the ends half of the samples are drawn [rad]
     lanes: int = static(default=32)
     edge_steps: int = static(default=32)
 
@@ -119,9 +120,20 @@ class RRTConnect:
         connects = jnp.concatenate([jnp.zeros(half, bool), newest >= 0])
         chosen = jnp.concatenate([jnp.zeros(half, jnp.int32), chosen.astype(jnp.int32)])
 
-        aim = jnp.where(
-            connects[:, None], tree.q[chosen], sample_configurations(world, key, self.lanes)
+        # Half of the samples near the two ends: where limits are far apart, few others serve.
+        ends = tree.q[0] + jnp.stack([jnp.zeros_like(tree.q[0]), difference(world, *tree.q[:2])])
+        near = dataclasses.replace(
+            world,
+            lower=jnp.maximum(world.lower, jnp.min(ends, axis=0) - self.margin),
+            upper=jnp.minimum(world.upper, jnp.max(ends, axis=0) + self.margin),
         )
+        key_near, key_far = jax.random.split(key)
+        sample = jnp.where(
+            (lane // 2 % 2 == 0)[:, None],
+            sample_configurations(near, key_near, self.lanes),
+            sample_configurations(world, key_far, self.lanes),
+        )
+        aim = jnp.where(connects[:, None], tree.q[chosen], sample)
         side = jnp.where(connects, 1 - node.side[chosen], lane % 2)
         apart = trees.distances(world, tree, aim)
         nearest = jnp.argmin(jnp.where(node.side == side[:, None], apart, jnp.inf), axis=1)

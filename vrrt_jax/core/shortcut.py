@@ -24,7 +24,7 @@ class _Path:
 
 
 def shortcut(
-    world: World, path: np.ndarray, *, key: jax.Array, rounds: int = 60, patience: int = 12
+    world: World, path: np.ndarray, *, key: jax.Array, rounds: int = 150, patience: int = 20
 ) -> np.ndarray:
     """Shorten a collision-free path; the ends stay.
 
