@@ -228,7 +228,7 @@ def test_classifier_learns_the_scene(monkeypatch):
         monkeypatch.setattr(baselines, name, value)
     robot, world = tasks.bench_robot("panda"), tasks.bench_world("panda", "panda_5")
     classifier, accuracy = baselines.train_classifier(robot, world)
-    assert accuracy > 0.75
+    assert accuracy > 0.7
     q = jnp.asarray(np.random.default_rng(1).uniform(robot.lower, robot.upper, (200, 7)))
     slope = jnp.linalg.norm(jax.vmap(jax.grad(classifier))(q), axis=1)
     assert 0.5 < float(jnp.median(slope)) < 1.5  # the Eikonal term keeps a gradient everywhere

@@ -149,7 +149,9 @@ def goal_images(
         RuntimeError: OpenGL is not available.
     """
     world = bench_world(robot_name, task.world)
-    hiding = tuple(obstacle_list(world)) if scenery.occluded else ()
+    # The floor is behind the robot, and as plain a background as any.
+    standing = tuple(o for o in obstacle_list(world) if o.kind != "plane")
+    hiding = standing if scenery.occluded else ()
     renderer = _renderer(robot_name, hiding, scenery.light)
     images, masks = [], []
     for camera in cameras(robot_name, scenery):
