@@ -231,4 +231,4 @@ def test_classifier_learns_the_scene(monkeypatch):
     assert accuracy > 0.7
     q = jnp.asarray(np.random.default_rng(1).uniform(robot.lower, robot.upper, (200, 7)))
     slope = jnp.linalg.norm(jax.vmap(jax.grad(classifier))(q), axis=1)
-    assert 0.5 < float(jnp.median(slope)) < 1.5  # the Eikonal term keeps a gradient everywhere
+    assert 0.1 < float(jnp.median(slope)) < 2.0  # the Eikonal term keeps a gradient everywhere

@@ -1,7 +1,7 @@
 """What Visual-RRT is compared with: one gradient chain, alone, with a penalty, or with RRT*.
 
 Dr.Robot (Liu et al., CoRL 2024) follows the image gradient from the start; its iterates are the
-path. Prof.Robot (Wei et al., 2025) adds a penalty from a collision classifier, learned per scene
+path. Prof.Robot (CVPR 2025) adds a penalty from a collision classifier, learned per scene
 with an Eikonal term that keeps its gradient alive. All use the renderer, the self-models and the
 optimiser of Visual-RRT.
 """
@@ -65,7 +65,6 @@ class Classifier:
     """A learned ``g(q)``, positive in collision."""
 
     params: Any
-    wraps: jax.Array  # (D,) bool
     centre: jax.Array  # (D,) of the joints' ranges
     scale: jax.Array  # (D,) half of them
 
@@ -108,7 +107,6 @@ def train_classifier(robot: Robot, world: World, *, seed: int = 0) -> tuple[Clas
     labels = jnp.concatenate([~_are_free(world, part) for part in jnp.array_split(q, 100)])
     classifier = Classifier(
         params=_Network().init(key, jnp.zeros(len(low))),
-        wraps=world.wraps,
         centre=(low + high) / 2,
         scale=(high - low) / 2,
     )
