@@ -57,34 +57,30 @@ def finish_visual(
         config: settings.
     """
     score, q = np.asarray(found.tree.score), np.asarray(found.tree.q)
-    if polishing is not None and found.stopped not in (Stopped.TIME_LIMIT, Stopped.INTERRUPTED):
-        settings, fine_goal_loss = polishing
+    hurried = found.stopped in (Stopped.TIME_LIMIT, Stopped.INTERRUPTED)
+    if polishing is not None and not hurried:
+        settings, goal_loss = polishing
         nodes = list(_distinct(world, score, q, q_start, config.hypotheses, np.inf))
         chosen = q[np.resize(nodes, config.hypotheses)]
-        found, (q_fine, loss_fine) = _clocked(found, _polish, world, settings, chosen, key)
-        matches = np.flatnonzero(loss_fine <= fine_goal_loss)  # best first
-        if len(matches):
-            best, path = matches[0], None
-            for best in matches[:TRIED]:
-                found, path = _connected(world, found, q_start, q_fine[best], key, config)
-                if path is not None:
-                    break
-            end = q_fine[best], float(loss_fine[best]), fine_goal_loss
-            return finish(robot, world, found, path, *end, key, config, q_start)
-
-    if score.min() > goal_loss:  # nothing matches: the best that a path leads to
-        score = np.where(np.asarray(found.tree.cost) < trees.UNREACHED, score, np.inf)
-    for best in _distinct(world, score, q, q_start, TRIED, goal_loss):
-        path = tree_path(found.tree, best)
-        if np.array_equal(path[0], q_start) or score[best] > goal_loss:
-            break
-        found, path = _connected(world, found, q_start, q[best], key, config)
+        found, (q, score) = _clocked(found, _polish, world, settings, chosen, key)
+        ends = [k for k in range(len(q)) if np.isfinite(score[k])] or [0]
+        paths = {}
+    else:
+        if hurried and score.min() > goal_loss:  # nothing matches: the best that a path leads to
+            score = np.where(np.asarray(found.tree.cost) < trees.UNREACHED, score, np.inf)
+        ends = list(_distinct(world, score, q, q_start, TRIED, goal_loss))
+        paths = {end: tree_path(found.tree, end) for end in ends}
+        paths = {end: path for end, path in paths.items() if np.array_equal(path[0], q_start)}
+    for end in ends[:TRIED]:
+        path = paths.get(end)
+        if path is None:
+            found, path = _connected(world, found, q_start, q[end], key, config)
         if path is not None:
             break
     else:
-        best, path = int(np.argmin(score)), None
-    end = q[best], float(score[best]), goal_loss
-    return finish(robot, world, found, path, *end, key, config, q_start)
+        end, path = ends[0], None
+    target, loss = q[end], float(score[end])
+    return finish(robot, world, found, path, target, loss, goal_loss, key, config, q_start)
 
 
 def _distinct(
