@@ -57,8 +57,11 @@ class PlannerConfig:
 
     @classmethod
     def paper(cls, **changes: Any) -> "PlannerConfig":
-        """The published method (Visual-RRT, CVPR 2026): one tree, constant Adam steps."""
-        paper = {"probes": 0, "hypotheses": 0, "anneal": 0.0, "settle": 0}
+        """The published method (Visual-RRT, CVPR 2026): one tree, constant Adam steps.
+
+        It searches until the loss has not improved for 100 iterations, matched or not.
+        """
+        paper = {"probes": 0, "hypotheses": 0, "anneal": 0.0, "settle": 100}
         paper |= {"min_improvement": 1e-4, "min_ratio": 1.0}
         return cls(**{**paper, **changes})
 
