@@ -158,6 +158,6 @@ def test_self_models_come_back(tmp_path):
     for a, b in zip(packed.levels, copy.levels, strict=True):
         assert (a.size_px, a.psnr_db, a.match_bar) == (b.size_px, b.psnr_db, b.match_bar)
         np.testing.assert_allclose(a.splats.mean, b.splats.mean, atol=1e-3)
-    assert [level.size_px for level in packed.levels] == [32, 64, 256]
+    assert [level.size_px for level in packed.levels] == [32, 64, 128, 256]
     assert packed.level_for(40).size_px == 64 and packed.level_for(900).size_px == 256
     assert packed.level_for(64).psnr_db >= 35 and packed.level_for(256).psnr_db >= 30

@@ -169,7 +169,9 @@ def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
                 distance, [v["path_length"] or float("nan") for v in levels], "o-", label=name
             )
             labels.append(name)
-            stacks.append([sum(v["causes"].get(c, 0) for v in levels) for c in CAUSES])
+            total = sum(v["n"] for v in levels)
+            counts = [sum(v["causes"].get(c, 0) for v in levels) for c in CAUSES]
+            stacks.append([100 * count / total for count in counts])
             rows = results["tasks"]
             if "by_variant" in results:
                 rows = [row for row in rows if row["variant"] == name]
@@ -180,7 +182,7 @@ def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
         causes.barh(labels, width, left=left, color=colour, label=cause)
         left = [a + b for a, b in zip(left, width, strict=True)]
     by_level.set(xlabel="distance from start to goal [rad]", ylabel="success [%]", ylim=(0, 102))
-    causes.set(xlabel="failed tasks")
+    causes.set(xlabel="failed tasks [%]", xlim=(0, 100))
     causes.invert_yaxis()
     times.set(xlabel="planning time without compilation [s]", ylabel="tasks")
     lengths.set(xlabel="distance from start to goal [rad]", ylabel="path length [rad]")
