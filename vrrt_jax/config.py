@@ -32,10 +32,10 @@ class PlannerConfig:
     probe_steps: int = 60  # Adam steps that the kept ones take at that resolution
     probes_kept: int = 64  # best of them, which take those steps and become roots (re-compiles)
     probe_px: int = 32  # image height that they are rendered at (re-compiles)
-    hypotheses: int = 4  # matches that are polished on a larger image; 0 = none (re-compiles)
-    polish_lanes: int = 8  # samples of each, along what the image leaves open (re-compiles)
+    hypotheses: int = 4  # matches that are polished on a larger image; 0 = none
+    polish_lanes: int = 8  # samples of each, along what the image leaves open
     polish_px: int = 128  # height of that image (re-compiles)
-    polish_kept: int = 6  # best of all samples (re-compiles)
+    polish_kept: int = 6  # best of all samples
     polish_steps: tuple[int, int] = (4, 8)  # Levenberg-Marquardt, of all and further of the best
     polish_reach: float = 1.5  # how far the samples spread at most [rad]
     start_prior: float = 0.005  # goal losses that a radian from the start costs there

@@ -17,7 +17,7 @@ from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import Rejection, Status
 from vrrt_jax.core.verify import verify_path
 from vrrt_jax.core.world import World, obstacle_list
-from vrrt_jax.polish import Polishing, polish
+from vrrt_jax.polish import Polishing, first_look, polish
 from vrrt_jax.robots.robot import Robot
 
 STATUS_OF = {
@@ -31,15 +31,13 @@ TRIED = 3  # matched configurations that are tried before there is no path
 DISTINCT = 0.3  # [rad] distance at which they count as different
 SAME_LOSS = 1.05  # losses within this factor are the same match
 
-_polish = jax.jit(polish)
-
 
 def finish_visual(
     robot: Robot,
     world: World,
     found: SearchResult,
     goal_loss: float,
-    polishing: tuple[Polishing, float] | None,
+    polishing: Polishing | None,
     q_start: np.ndarray,
     key: jax.Array,
     config: PlannerConfig,
@@ -51,7 +49,7 @@ def finish_visual(
         world: robot and obstacles.
         found: the search.
         goal_loss: that counts as matched in it.
-        polishing: how to look at matches more closely, and the loss that counts there.
+        polishing: how to look at matches more closely.
         q_start: (D,).
         key: random key.
         config: settings.
@@ -59,10 +57,9 @@ def finish_visual(
     score, q = np.asarray(found.tree.score), np.asarray(found.tree.q)
     hurried = found.stopped in (Stopped.TIME_LIMIT, Stopped.INTERRUPTED)
     if polishing is not None and not hurried:
-        settings, goal_loss = polishing
+        goal_loss = polishing.goal_loss
         nodes = list(_distinct(world, score, q, q_start, config.hypotheses, np.inf))
-        chosen = q[np.resize(nodes, config.hypotheses)]
-        found, (q, score) = _clocked(found, _polish, world, settings, chosen, key)
+        found, (q, score) = _polished(found, world, polishing, q[nodes], key)
         ends = [k for k in range(len(q)) if np.isfinite(score[k])] or [0]
         paths = {}
     else:
@@ -130,13 +127,16 @@ def _connected(
     return found, connection_path(connection.tree)
 
 
-def _clocked(found: SearchResult, function: Any, *args: Any) -> tuple[SearchResult, Any]:
-    """Call a jitted function; its time is added to the search's, compilation apart."""
-    result, compile_s, run_s = timed(function, *args)
-    found = dataclasses.replace(
-        found, compile_s=found.compile_s + compile_s, search_s=found.search_s + run_s
-    )
-    return found, jax.device_get(result)
+def _polished(
+    found: SearchResult, world: World, polishing: Polishing, q: np.ndarray, key: jax.Array
+) -> tuple[SearchResult, tuple[np.ndarray, np.ndarray]]:
+    """What :func:`polish` returns; its time is added to the search's."""
+    compile_s = first_look(world, polishing, q[0])
+    started = time.perf_counter()
+    result = polish(world, polishing, q, int(jax.random.bits(key, dtype=jnp.uint32)))
+    search_s = found.search_s + time.perf_counter() - started
+    found = dataclasses.replace(found, compile_s=found.compile_s + compile_s, search_s=search_s)
+    return found, result
 
 
 def timed(function: Any, *args: Any) -> tuple[Any, float, float]:

@@ -8,17 +8,21 @@ bare flange, stays near the start: a weak prior sees to that.
 """
 
 import dataclasses
+import time
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vrrt_jax.core.edges import difference, into_limits
-from vrrt_jax.core.types import pytree, static
+from vrrt_jax.core.types import pytree
 from vrrt_jax.core.world import World, is_free
 from vrrt_jax.splat.loss import weighted_goal, weighted_image
 from vrrt_jax.splat.raster import map_lanes
 from vrrt_jax.visual import VisualPolicy
 
+LANES = 8  # configurations looked at in one call
 PROBE = 0.01  # [rad] step of the finite differences
 OTHERS = 0.5  # standard deviations that samples spread along all but the weakest direction
 RIDGE = 1e-7  # keeps joints that no pixel sees where they are
@@ -26,71 +30,116 @@ LONGEST = 0.3  # [rad] of one step of a joint
 
 
 @pytree
-class Polishing:
-    """How configurations are polished."""
+class Closer:
+    """A closer look at the goal."""
 
     policy: VisualPolicy  # with the larger goal; only its loss is used
     q_start: jax.Array  # (D,)
     prior: jax.Array  # () loss that a radian away from the start costs
-    slack: jax.Array  # () how much loss the spread may add, to second order
-    reach: jax.Array  # () how far samples spread at most [rad]
-    steps: jax.Array  # (2,) i32 of all samples, and further ones of the best
-    lanes: int = static()  # samples of each configuration, itself and half a turn among them
-    kept: int = static()  # the best of all samples
 
 
-@pytree
-class _Descent:
-    """Levenberg-Marquardt from n configurations at once."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Polishing:
+    """How configurations are polished."""
 
-    q: jax.Array  # (n, D)
-    loss: jax.Array  # (n,) of the image alone
-    cost: jax.Array  # (n,) and with the prior
-    residual: jax.Array  # (n, pixels + D)
-    jacobian: jax.Array  # (n, D, pixels + D)
-    damping: jax.Array  # (n,)
+    closer: Closer
+    goal_loss: float  # that counts as matched there
+    slack: float  # how much loss the spread of samples may add, to second order
+    reach: float  # how far they spread at most [rad]
+    lanes: int  # samples of each configuration, itself and half a turn among them
+    kept: int  # the best of all samples
+    steps: tuple[int, int]  # of all samples, and further ones of the best
+
+
+class _Look(NamedTuple):
+    """What is seen of n configurations."""
+
+    q: np.ndarray  # (n, D)
+    loss: np.ndarray  # (n,) of the image alone
+    cost: np.ndarray  # (n,) and with the prior
+    matrix: np.ndarray  # (n, D, D) of Gauss and Newton, half of the cost's second derivatives
+    slope: np.ndarray  # (n, D) half of its first
+    free: np.ndarray  # (n,) bool
 
 
 def polish(
-    world: World, polishing: Polishing, q: jax.Array, key: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+    world: World, polishing: Polishing, q: np.ndarray, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Spread configurations (H, D) and descend.
 
     Returns:
         Configurations (kept, D), best first, and their image losses; infinite in collision.
     """
-    near = _begin(world, polishing, q)
-    samples = _begin(world, polishing, _spread(world, polishing, near, key))
+    rng = np.random.default_rng(seed)
+    samples = _look(world, polishing, _spread(_look(world, polishing, q), polishing, rng))
     samples = _descend(world, polishing, samples, polishing.steps[0])
-    _, best = jax.lax.top_k(-samples.cost, polishing.kept)
-    kept = jax.tree.map(lambda leaf: leaf[best], samples)
+    kept = _first(samples, samples.cost, polishing.kept)
     kept = _descend(world, polishing, kept, polishing.steps[1])
-    free = jax.vmap(is_free, (None, 0))(world, kept.q)
-    order = jnp.argsort(jnp.where(free, kept.cost, jnp.inf))
-    return kept.q[order], jnp.where(free, kept.loss, jnp.inf)[order]
+    kept = _first(kept, np.where(kept.free, kept.cost, np.inf), polishing.kept)
+    return kept.q, np.where(kept.free, kept.loss, np.inf)
 
 
-def _spread(world: World, polishing: Polishing, near: _Descent, key: jax.Array) -> jax.Array:
+def first_look(world: World, polishing: Polishing, q: np.ndarray) -> float:
+    """Look at one configuration (D,), and return the seconds; most of them go into compilation."""
+    started = time.perf_counter()
+    _look(world, polishing, q[None])
+    return time.perf_counter() - started
+
+
+def _first(look: _Look, cost: np.ndarray, num: int) -> _Look:
+    """Those of lowest cost, in order."""
+    order = np.argsort(cost, kind="stable")[:num]
+    return _Look(*(column[order] for column in look))
+
+
+def _spread(near: _Look, polishing: Polishing, rng: np.random.Generator) -> np.ndarray:
     """Samples (H * lanes, D) along the directions that the image tells little about."""
-    curvature = 2.0 * jnp.einsum("hip,hjp->hij", near.jacobian, near.jacobian)
-    values, vectors = jnp.linalg.eigh(curvature)
-    reach = jnp.sqrt(2.0 * polishing.slack / jnp.maximum(values, 1e-9))
-    reach = jnp.minimum(reach, polishing.reach)[:, None]
+    values, vectors = np.linalg.eigh(2.0 * near.matrix)  # rising
+    reach = np.minimum(np.sqrt(2.0 * polishing.slack / np.maximum(values, 1e-9)), polishing.reach)
     num, joints = polishing.lanes - 2, near.q.shape[1]
-    along = OTHERS * jax.random.normal(key, (len(near.q), num, joints))
-    along = along.at[:, :, 0].set(jnp.linspace(-1.0, 1.0, num))  # eigenvalues rise
-    samples = near.q[:, None] + jnp.einsum("hij,hlj->hli", vectors, reach * along)
+    along = OTHERS * rng.normal(size=(len(near.q), num, joints))
+    along[:, :, 0] = np.linspace(-1.0, 1.0, num)
+    samples = near.q[:, None] + np.einsum("hij,hlj->hli", vectors, reach[:, None] * along)
     # Grippers look alike after half a turn.
     weakest = vectors[:, :, 0]
-    away_from_centre = jnp.sum(near.q * weakest, axis=1, keepdims=True) > 0
-    turned = near.q + jnp.where(away_from_centre, -jnp.pi, jnp.pi) * weakest
-    samples = jnp.concatenate([near.q[:, None], turned[:, None], samples], axis=1)
-    return into_limits(world, samples.reshape(-1, joints))
+    turn = np.where(np.sum(near.q * weakest, axis=1, keepdims=True) > 0, -np.pi, np.pi)
+    turned = near.q + turn * weakest
+    return np.concatenate([near.q[:, None], turned[:, None], samples], axis=1).reshape(-1, joints)
 
 
-def _begin(world: World, polishing: Polishing, q: jax.Array) -> _Descent:
-    """Images at configurations (n, D), and their derivatives by finite differences."""
-    policy, joints = polishing.policy, q.shape[1]
+def _descend(world: World, polishing: Polishing, now: _Look, steps: int) -> _Look:
+    """Levenberg-Marquardt: steps that lower the cost; those that do not raise the damping."""
+    damping = np.full(len(now.q), 1e-2)
+    for _ in range(steps):
+        diagonal = np.einsum("nii->ni", now.matrix)
+        ridge = damping[:, None] * diagonal + RIDGE
+        matrix = now.matrix + ridge[:, :, None] * np.eye(now.q.shape[1])
+        change = -np.linalg.solve(matrix, now.slope[..., None])[..., 0]
+        tried = _look(world, polishing, now.q + np.clip(change, -LONGEST, LONGEST))
+        better = tried.cost < now.cost
+        damping *= np.where(better, 0.3, 4.0)
+        now = _Look(
+            *(
+                np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+                for new, old in zip(tried, now, strict=True)
+            )
+        )
+    return now
+
+
+def _look(world: World, polishing: Polishing, q: np.ndarray) -> _Look:
+    """Look at configurations (n, D), a few at a time: one program serves any number."""
+    blocks = -(-len(q) // LANES)
+    padded = np.resize(q, (blocks * LANES, q.shape[1])).astype(np.float32)
+    seen = [jax.device_get(_look_at(world, polishing.closer, b)) for b in np.split(padded, blocks)]
+    return _Look(*(np.concatenate(column)[: len(q)] for column in zip(*seen, strict=True)))
+
+
+@jax.jit
+def _look_at(world: World, closer: Closer, q: jax.Array) -> tuple[jax.Array, ...]:
+    """Columns of a :class:`_Look`; derivatives are finite differences."""
+    policy, joints = closer.policy, q.shape[1]
+    q = into_limits(world, q)
     places = q[:, None] + PROBE * jnp.eye(joints + 1, joints, -1)
 
     def image(q):
@@ -100,38 +149,14 @@ def _begin(world: World, polishing: Polishing, q: jax.Array) -> _Descent:
 
     images = map_lanes(image, places.reshape(-1, joints)).reshape(len(q), joints + 1, -1)
     residual = images[:, 0] - weighted_goal(policy.goal)
+    jacobian = (images[:, 1:] - images[:, :1]) / PROBE
+    away = difference(world, closer.q_start, q)
     loss = jnp.sum(residual**2, axis=1)
-    root = jnp.sqrt(polishing.prior)
-    away = root * difference(world, polishing.q_start, q)
-    outwards = jnp.broadcast_to(root * jnp.eye(joints), (len(q), joints, joints))
-    slopes = (images[:, 1:] - images[:, :1]) / PROBE
-    return _Descent(
-        q=q,
-        loss=loss,
-        cost=loss + jnp.sum(away**2, axis=1),
-        residual=jnp.concatenate([residual, away], axis=1),
-        jacobian=jnp.concatenate([slopes, outwards], axis=2),
-        damping=jnp.full(len(q), 1e-2),
+    return (
+        q,
+        loss,
+        loss + closer.prior * jnp.sum(away**2, axis=1),
+        jnp.einsum("nip,njp->nij", jacobian, jacobian) + closer.prior * jnp.eye(joints),
+        jnp.einsum("nip,np->ni", jacobian, residual) + closer.prior * away,
+        jax.vmap(is_free, (None, 0))(world, q),
     )
-
-
-def _descend(world: World, polishing: Polishing, start: _Descent, steps: jax.Array) -> _Descent:
-    """Steps that lower the cost; those that do not raise the damping."""
-
-    def step(_, now: _Descent) -> _Descent:
-        matrix = jnp.einsum("nip,njp->nij", now.jacobian, now.jacobian)
-        slope = jnp.einsum("nip,np->ni", now.jacobian, now.residual)
-        diagonal = jnp.einsum("nii->ni", matrix)
-        matrix += jax.vmap(jnp.diag)(now.damping[:, None] * diagonal + RIDGE)
-        change = -jnp.linalg.solve(matrix, slope[..., None])[..., 0]
-        q = into_limits(world, now.q + jnp.clip(change, -LONGEST, LONGEST))
-        tried = _begin(world, polishing, q)
-        better = tried.cost < now.cost
-        damping = now.damping * jnp.where(better, 0.3, 4.0)
-
-        def choose(new: jax.Array, old: jax.Array) -> jax.Array:
-            return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-        return dataclasses.replace(jax.tree.map(choose, tried, now), damping=damping)
-
-    return jax.lax.fori_loop(0, steps, step, start)

@@ -12,7 +12,7 @@ from vrrt_jax import checks
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.kinematics import batch_link_poses
 from vrrt_jax.core.search import Stop, make_stop
-from vrrt_jax.polish import Polishing
+from vrrt_jax.polish import Closer, Polishing
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.splat.goal import prepare_goal
 from vrrt_jax.splat.model import SelfModel
@@ -66,7 +66,7 @@ class Setup:
     policy: VisualPolicy
     goal_loss: float  # that counts as matched
     probing: Probing
-    polishing: tuple[Polishing, float] | None  # and the loss that counts as matched there
+    polishing: Polishing | None
 
 
 def visual_setup(sight: Sight, q_start: np.ndarray, config: PlannerConfig) -> Setup:
@@ -122,20 +122,23 @@ def visual_probing(sight: Sight, policy: VisualPolicy, config: PlannerConfig) ->
 
 def visual_polishing(
     sight: Sight, policy: VisualPolicy, q_start: np.ndarray, config: PlannerConfig
-) -> tuple[Polishing, float]:
-    """How matches are looked at after it, and the loss that counts as matched there."""
+) -> Polishing:
+    """How matches are looked at after the search."""
     fields, goal_loss = sight.at(config.polish_px, config.match_scale)
-    polishing = Polishing(
+    closer = Closer(
         policy=dataclasses.replace(policy, **fields),
         q_start=jnp.asarray(q_start),
         prior=jnp.float32(config.start_prior * goal_loss),
-        slack=jnp.float32(POLISH_SLACK * goal_loss),
-        reach=jnp.float32(config.polish_reach),
-        steps=jnp.asarray(config.polish_steps, jnp.int32),
-        lanes=config.polish_lanes,
-        kept=min(config.polish_kept, config.hypotheses * config.polish_lanes),
     )
-    return polishing, goal_loss
+    return Polishing(
+        closer=closer,
+        goal_loss=goal_loss,
+        slack=POLISH_SLACK * goal_loss,
+        reach=config.polish_reach,
+        lanes=config.polish_lanes,
+        kept=config.polish_kept,
+        steps=config.polish_steps,
+    )
 
 
 def visual_stop(config: PlannerConfig, goal_loss: float) -> Stop:
