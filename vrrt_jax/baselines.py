@@ -22,7 +22,7 @@ from vrrt_jax import checks
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.edges import into_limits
 from vrrt_jax.core.types import pytree
-from vrrt_jax.core.world import World, is_free
+from vrrt_jax.core.world import World, batch_is_free
 from vrrt_jax.planner import plan_to_configuration
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.sight import Sight, visual_policy
@@ -104,7 +104,7 @@ def train_classifier(robot: Robot, world: World, *, seed: int = 0) -> tuple[Clas
     key = jax.random.key(seed)
     low, high = jnp.asarray(robot.lower, jnp.float32), jnp.asarray(robot.upper, jnp.float32)
     q = jax.random.uniform(key, (SAMPLES + SAMPLES // 10, len(low)), minval=low, maxval=high)
-    labels = jnp.concatenate([~_are_free(world, part) for part in jnp.array_split(q, 100)])
+    labels = jnp.concatenate([~batch_is_free(world, part) for part in jnp.array_split(q, 100)])
     classifier = Classifier(
         params=_Network().init(key, jnp.zeros(len(low))),
         centre=(low + high) / 2,
@@ -119,9 +119,6 @@ def train_classifier(robot: Robot, world: World, *, seed: int = 0) -> tuple[Clas
     held_out = labels[SAMPLES:]
     accuracy = 0.5 * (jnp.mean(right, where=held_out) + jnp.mean(right, where=~held_out))
     return classifier, float(accuracy)
-
-
-_are_free = jax.jit(jax.vmap(is_free, (None, 0)))
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -218,38 +215,20 @@ def _chain(world, policy: VisualPolicy, classifier, q, numbers, steps):
     return carry[2], carry[3]
 
 
-def dr_robot_rrt_star(
-    robot: Robot,
-    world: World,
-    self_model: SelfModel,
-    camera: Camera | Sequence[Camera],
-    goal_image: np.ndarray | Sequence[np.ndarray],
-    q_start: np.ndarray,
-    *,
-    key: jax.Array,
-    config: ChainConfig | None = None,
-    iterations: int = 60,
-    mask: Any = None,
+def rrt_star_to_estimate(
+    robot: Robot, world: World, estimate: BaselineResult, *, key: jax.Array, iterations: int = 60
 ) -> BaselineResult:
-    """Estimate the goal with :func:`dr_robot`, then plan to the estimate with RRT*.
+    """Plan with RRT* from where :func:`dr_robot` began to where it ended.
 
     Args:
-        robot: as for :func:`dr_robot`, and so are the next five.
+        robot: as for :func:`dr_robot`.
         world: robot and obstacles.
-        self_model: of the robot.
-        camera: of the goal image.
-        goal_image: to match.
-        q_start: (D,).
+        estimate: of the goal.
         key: random key of RRT*.
-        config: of the chain.
         iterations: of RRT*, of 32 samples each.
-        mask: as for :func:`vrrt_jax.plan`.
     """
-    estimate = dr_robot(
-        robot, world, self_model, camera, goal_image, q_start, config=config, mask=mask
-    )
-    q_goal = estimate.path[-1]
-    if not bool(_are_free(world, jnp.asarray(q_goal)[None])[0]):
+    q_start, q_goal = estimate.path[0], estimate.path[-1]
+    if not bool(batch_is_free(world, jnp.asarray(q_goal)[None])[0]):
         return dataclasses.replace(estimate, found_path=False)
     found = plan_to_configuration(
         robot,

@@ -68,10 +68,10 @@ def _parser() -> argparse.ArgumentParser:
     spheres.add_argument("--num", type=int, default=10_000, help="configurations to measure on")
 
     bench = commands.add_parser("bench", help="measure speed, success or settings")
-    bench.set_defaults(run=_bench)
     kinds = bench.add_subparsers(dest="what", required=True)
     for what in ("kinematics", "raster", "search"):
         speed = kinds.add_parser(what, help="how fast this machine is")
+        speed.set_defaults(run=_speed)
         speed.add_argument("--json", help="write the figures here")
     for what, words in (
         ("visual", "the paper's tasks, among obstacles"),
@@ -95,6 +95,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
+    parser.set_defaults(run=_protocol)
     parser.add_argument("--robot", required=True, help="panda, ur5e or fetch")
     parser.add_argument("--levels", default="0.5,1.0,1.5,2.0,2.5", help="distances [rad]")
     parser.add_argument("--tasks-per-level", type=int, default=20)
@@ -295,17 +296,18 @@ def _meshes(robot):
     return spec
 
 
-def _bench(arguments: argparse.Namespace) -> int:
+def _speed(arguments: argparse.Namespace) -> int:
     import importlib
 
-    if arguments.what not in ("visual", "pose", "ablation"):
-        figures = importlib.import_module(f"vrrt_jax.bench.{arguments.what}").run()
-        text = json.dumps(figures, indent=2)
-        print(text)
-        if arguments.json:
-            Path(arguments.json).write_text(text + "\n")
-        return EXIT_SOLVED
+    figures = importlib.import_module(f"vrrt_jax.bench.{arguments.what}").run()
+    text = json.dumps(figures, indent=2)
+    print(text)
+    if arguments.json:
+        Path(arguments.json).write_text(text + "\n")
+    return EXIT_SOLVED
 
+
+def _protocol(arguments: argparse.Namespace) -> int:
     from vrrt_jax.bench import protocol, runner, tables
     from vrrt_jax.bench.tasks import Scenery
 

@@ -17,7 +17,7 @@ from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import Rejection, Status
 from vrrt_jax.core.verify import verify_path
 from vrrt_jax.core.world import World, obstacle_list
-from vrrt_jax.polish import Polishing, first_look, polish
+from vrrt_jax.polish import LANES, Polishing, look_at, polish
 from vrrt_jax.robots.robot import Robot
 
 STATUS_OF = {
@@ -131,7 +131,8 @@ def _polished(
     found: SearchResult, world: World, polishing: Polishing, q: np.ndarray, key: jax.Array
 ) -> tuple[SearchResult, tuple[np.ndarray, np.ndarray]]:
     """What :func:`polish` returns; its time is added to the search's."""
-    compile_s = first_look(world, polishing, q[0])
+    block = np.resize(q, (LANES, q.shape[1]))
+    _, compile_s, _ = timed(look_at, world, polishing.closer, block)
     started = time.perf_counter()
     result = polish(world, polishing, q, int(jax.random.bits(key, dtype=jnp.uint32)))
     search_s = found.search_s + time.perf_counter() - started

@@ -8,7 +8,6 @@ bare flange, stays near the start: a weak prior sees to that.
 """
 
 import dataclasses
-import time
 from typing import NamedTuple
 
 import jax
@@ -79,13 +78,6 @@ def polish(
     return kept.q, np.where(kept.free, kept.loss, np.inf)
 
 
-def first_look(world: World, polishing: Polishing, q: np.ndarray) -> float:
-    """Look at one configuration (D,), and return the seconds; most of them go into compilation."""
-    started = time.perf_counter()
-    _look(world, polishing, q[None])
-    return time.perf_counter() - started
-
-
 def _first(look: _Look, cost: np.ndarray, num: int) -> _Look:
     """Those of lowest cost, in order."""
     order = np.argsort(cost, kind="stable")[:num]
@@ -131,12 +123,12 @@ def _look(world: World, polishing: Polishing, q: np.ndarray) -> _Look:
     """Look at configurations (n, D), a few at a time: one program serves any number."""
     blocks = -(-len(q) // LANES)
     padded = np.resize(q, (blocks * LANES, q.shape[1])).astype(np.float32)
-    seen = [jax.device_get(_look_at(world, polishing.closer, b)) for b in np.split(padded, blocks)]
+    seen = [jax.device_get(look_at(world, polishing.closer, b)) for b in np.split(padded, blocks)]
     return _Look(*(np.concatenate(column)[: len(q)] for column in zip(*seen, strict=True)))
 
 
 @jax.jit
-def _look_at(world: World, closer: Closer, q: jax.Array) -> tuple[jax.Array, ...]:
+def look_at(world: World, closer: Closer, q: jax.Array) -> tuple[jax.Array, ...]:
     """Columns of a :class:`_Look`; derivatives are finite differences."""
     policy, joints = closer.policy, q.shape[1]
     q = into_limits(world, q)

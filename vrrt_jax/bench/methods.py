@@ -162,13 +162,12 @@ def _plan(inputs, key, config: PlannerConfig, masks, guess) -> Attempt:
 
 
 def _baseline(inputs, robot_name: str, task: Task, method: str, key, masks) -> Attempt:
+    classifier = None
+    if method == "prof-robot" and task.world:
+        classifier = _classifier(robot_name, task.world)
+    found = baselines.dr_robot(*inputs, classifier=classifier, mask=masks)
     if method == "dr-robot-rrt-star":
-        found = baselines.dr_robot_rrt_star(*inputs, key=key, mask=masks)
-    else:
-        classifier = None
-        if method == "prof-robot" and task.world:
-            classifier = _classifier(robot_name, task.world)
-        found = baselines.dr_robot(*inputs, classifier=classifier, mask=masks)
+        found = baselines.rrt_star_to_estimate(inputs[0], inputs[1], found, key=key)
     return Attempt(
         path=found.path,
         matched=found.loss <= found.goal_loss,

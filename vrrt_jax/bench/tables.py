@@ -66,13 +66,10 @@ def write_page(files: Sequence[Path], folder: Path) -> Path:
         ValueError: a file is no results file.
     """
     found = [_read(file) for file in files]
-    parts = ["# Results", "", PAPER_NOTE, ""]
+    parts = ["# Results", "", PAPER_NOTE, "", "## Average success [%]", "", _overview(found), ""]
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for results in found:
         groups.setdefault((results["what"], results["robot"]), []).append(results)
-    overview = _overview(found)
-    if overview:
-        parts += ["## Average success [%]", "", overview, ""]
     for (what, robot), group in sorted(groups.items()):
         parts += [f"## {what}: {robot}", ""]
         for results in group:
@@ -88,7 +85,8 @@ def write_page(files: Sequence[Path], folder: Path) -> Path:
 def _read(file: Path) -> dict[str, Any]:
     try:
         results = json.loads(file.read_text())
-        return {**results, "rows": results["tasks"], "names": list(_variants(results))}
+        _variants(results)
+        return results
     except (OSError, ValueError, KeyError) as error:
         raise ValueError(f"'{file}' is no results file of vrrt bench: {error!r}") from None
 
@@ -186,8 +184,9 @@ def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
     causes.invert_yaxis()
     times.set(xlabel="planning time without compilation [s]", ylabel="tasks")
     lengths.set(xlabel="distance from start to goal [rad]", ylabel="path length [rad]")
-    for axis in (by_level, causes, times):
+    for axis in (by_level, times):
         axis.legend(fontsize="small")
+    causes.legend(fontsize="small", ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.12))
     figure.suptitle(f"{group[0]['what']}: {group[0]['robot']}")
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -4,14 +4,13 @@ import dataclasses
 import functools
 import zlib
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.edges import difference, into_limits
 from vrrt_jax.core.types import Obstacle
 from vrrt_jax.core.verify import contacts, verify_path
-from vrrt_jax.core.world import World, build_world, is_free, obstacle_list
+from vrrt_jax.core.world import World, batch_is_free, build_world, obstacle_list
 from vrrt_jax.problems import load_world
 from vrrt_jax.robots import Robot, load_robot
 from vrrt_jax.robots.robot import workspace
@@ -21,7 +20,6 @@ from vrrt_jax.splat.mujoco_images import MeshRenderer
 from vrrt_jax.splat.types import Camera
 
 ROBOTS = ("panda", "ur5e", "fetch")
-LEVELS = (0.5, 1.0, 1.5, 2.0, 2.5)  # ||q_start - q_goal|| [rad]
 WORLDS_PER_ROBOT = 6
 NUM_SLOTS = 12  # one shape for all worlds, so that none re-compiles
 IMAGE_PX = 480
@@ -97,7 +95,7 @@ def make_task(robot_name: str, level: float, index: int, seed: int, *, obstacles
         inside = robot.wraps | ((q_goal > robot.lower) & (q_goal < robot.upper))
         q_goal = np.asarray(into_limits(world, jnp.asarray(q_goal, jnp.float32)))
         free = [
-            np.asarray(_are_free(world, jnp.asarray(q, jnp.float32))) for q in (q_start, q_goal)
+            np.asarray(batch_is_free(world, jnp.asarray(q, jnp.float32))) for q in (q_start, q_goal)
         ]
         for i in np.flatnonzero(inside.all(1) & free[0] & free[1]):
             ends = q_start[i].astype(np.float32), q_goal[i]
@@ -112,9 +110,6 @@ def make_task(robot_name: str, level: float, index: int, seed: int, *, obstacles
                 q_goal=ends[1],
                 straight_is_blocked=not straight.ok,
             )
-
-
-_are_free = jax.jit(jax.vmap(is_free, (None, 0)))
 
 
 def joint_error(world: World, q: np.ndarray, q_goal: np.ndarray) -> np.ndarray:

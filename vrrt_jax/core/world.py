@@ -60,6 +60,9 @@ def is_free(world: World, q: jax.Array) -> jax.Array:
     return (_clearance(world, poses) > world.margin) & (_self_gap(world, poses) >= 0)
 
 
+batch_is_free = jax.jit(jax.vmap(is_free, (None, 0)))  # of q (n, D), for the host
+
+
 def _clearance(world: World, poses: jax.Array) -> jax.Array:
     distances = signed_distances(world.obstacles, place(world.cover, poses))
     return jnp.min(distances - world.cover_radius[:, None])

@@ -19,7 +19,7 @@ from scipy.cluster.vq import kmeans2
 from tqdm import tqdm
 
 from vrrt_jax.core.kinematics import chain_from_model, link_poses
-from vrrt_jax.core.world import build_world, is_free
+from vrrt_jax.core.world import batch_is_free, build_world
 from vrrt_jax.robots.robot import workspace
 from vrrt_jax.splat.camera import orbit, shrunk, stack_cameras
 from vrrt_jax.splat.loss import image_loss, psnr_db
@@ -136,12 +136,12 @@ def _claim(work: Path, robot, seed: int, config: FitConfig) -> None:
 
 def random_configurations(robot, num: int, rng: np.random.Generator) -> np.ndarray:
     """Configurations (num, D) inside the limits that do not touch themselves."""
-    free = jax.jit(jax.vmap(is_free, (None, 0)))
     world = build_world(robot)
     found = np.zeros((0, len(robot.lower)))
     while len(found) < num:
         q = rng.uniform(robot.lower, robot.upper, (256, len(robot.lower)))
-        found = np.concatenate([found, q[np.asarray(free(world, jnp.asarray(q, jnp.float32)))]])
+        free = np.asarray(batch_is_free(world, jnp.asarray(q, jnp.float32)))
+        found = np.concatenate([found, q[free]])
     return found[:num]
 
 
