@@ -167,6 +167,46 @@ def test_visual_meshes_keep_their_materials(panda):
     assert not any(names)
 
 
+def test_gripper_is_mounted_rigidly_where_its_joints_rest():
+    """Compare the folded gripper with the model it comes from, geom by geom."""
+    spec = sources.mesh_spec(load_robot("ur5e"))
+    if spec is None:
+        pytest.skip("the meshes are not installed (genesis-world and gym-hil)")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    tool = model.body("tool_base_mount").id
+    assert model.body_parentid[tool] == model.body("wrist_3_link").id
+    own = np.flatnonzero(model.geom_bodyid == tool)
+
+    source = mujoco.MjModel.from_xml_path(str(sources.tool_file("ur5e")))
+    there = mujoco.MjData(source)  # at rest: its joints at zero
+    there.qpos[:] = 0
+    mujoco.mj_kinematics(source, there)
+    mount = source.body("base_mount").id
+    meshes = {}
+    for geom in range(source.ngeom):
+        body = source.geom_bodyid[geom]
+        while body and body != mount:
+            body = source.body_parentid[body]
+        if body == mount and source.geom_dataid[geom] >= 0 and source.geom_group[geom] == 2:
+            name = source.mesh(source.geom_dataid[geom]).name
+            meshes.setdefault(name, []).append(
+                there.xmat[mount].reshape(3, 3).T @ (there.geom_xpos[geom] - there.xpos[mount])
+            )
+    assert sum(map(len, meshes.values())) == 14
+    found = {}
+    for geom in own:
+        name = model.mesh(model.geom_dataid[geom]).name.removeprefix("tool_")
+        found.setdefault(name, []).append(
+            data.xmat[tool].reshape(3, 3).T @ (data.geom_xpos[geom] - data.xpos[tool])
+        )
+    assert found.keys() == meshes.keys()
+    for name, places in meshes.items():
+        apart = np.linalg.norm(np.array(places)[:, None] - np.array(found[name])[None], axis=-1)
+        assert apart.min(axis=1).max() < 1e-6 and apart.min(axis=0).max() < 1e-6
+
+
 def test_collision_model_checks_what_it_should(panda):
     """Cover against obstacles, thin against thin, nothing else, in C MuJoCo by itself."""
     spec = mujoco.MjSpec.from_string(panda.xml)

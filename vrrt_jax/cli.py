@@ -59,6 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument("--out", required=True, help="a .npz file")
     fit.add_argument("--seed", type=int, default=0)
     fit.add_argument("--images", type=int, help="number of training images")
+    fit.add_argument("--detail", type=float, default=1.0, help="times the usual number of splats")
 
     spheres = commands.add_parser("spheres", help="fit collision spheres to a robot's meshes")
     spheres.set_defaults(run=_spheres)
@@ -244,7 +245,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     from vrrt_jax.splat.fit import FitConfig, fit_self_model
 
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
-    config = FitConfig()
+    config = FitConfig(detail=arguments.detail)
     if arguments.images is not None:
         config = dataclasses.replace(config, num_images=arguments.images)
     _writable(Path(arguments.out).parent)

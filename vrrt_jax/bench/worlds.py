@@ -13,9 +13,9 @@ from vrrt_jax.robots.robot import workspace
 
 COUNT = (5, 10)  # obstacles, beside the floor
 KINDS = ("box", "sphere", "capsule", "cylinder")
-SIZE = (0.04, 0.10)  # [m] radii and half edges
-LENGTH = (0.10, 0.25)  # [m] half lengths of capsules and cylinders
-SHELL = (0.35, 0.95)  # distance of centres from the workspace's, in its radii
+SIZE = (0.06, 0.14)  # [m] radii and half edges
+LENGTH = (0.15, 0.35)  # [m] half lengths of capsules and cylinders
+SHELL = (0.25, 0.85)  # distance of centres from the workspace's, in its radii
 COLOURS = ((0.30, 0.50, 0.75), (0.85, 0.65, 0.25), (0.85, 0.45, 0.30), (0.45, 0.65, 0.45))
 
 

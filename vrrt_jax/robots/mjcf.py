@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+_TOOL = "tool_"  # two models may use a name twice
 _UNPLANNED = {
     int(mujoco.mjtJoint.mjJNT_FREE): "free",
     int(mujoco.mjtJoint.mjJNT_BALL): "ball",
@@ -69,6 +70,47 @@ def keep_body(spec: mujoco.MjSpec, name: str) -> None:
             spec.delete(element)
     body = spec.body(name)
     body.pos, body.quat = [0, 0, 0], [1, 0, 0, 0]
+
+
+def mount(spec: mujoco.MjSpec, site: str, tool: mujoco.MjSpec, name: str) -> None:
+    """Put the body ``name`` of another model on a site, in place, rigid and in its rest position.
+
+    All that hangs on it becomes a part of it; names get the prefix ``tool_``.
+
+    Raises:
+        ValueError: there is no such site or body.
+    """
+    where, body = spec.site(site), tool.body(name)
+    if where is None or body is None:
+        raise ValueError(
+            f"cannot mount body '{name}' at site '{site}': "
+            f"{'the robot has no such site' if where is None else 'the tool has no such body'}"
+        )
+    _fold(tool, body)
+    mounted = where.attach_body(body, _TOOL, "")
+    mounted.pos, mounted.quat = [0, 0, 0.007], [1, 0, 0, -1]  # the thickness of the coupling
+
+
+def _fold(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:
+    """Make a body and everything that hangs on it one body."""
+    for child in list(body.bodies):
+        _fold(spec, child)
+        for geom in child.geoms:
+            offset, quaternion = np.zeros(3), np.zeros(4)
+            turned = child.quat / np.linalg.norm(child.quat)
+            mujoco.mju_mulPose(offset, quaternion, child.pos, turned, geom.pos, geom.quat)
+            body.add_geom(
+                type=geom.type,
+                meshname=geom.meshname,
+                size=geom.size,
+                material=geom.material,
+                rgba=geom.rgba,
+                contype=geom.contype,
+                conaffinity=geom.conaffinity,
+                pos=offset,
+                quat=quaternion,
+            )
+        spec.delete(child)
 
 
 def collide_visuals(spec: mujoco.MjSpec) -> None:

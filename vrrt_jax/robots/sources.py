@@ -29,9 +29,18 @@ class _Source:
     root: str | None = None  # body that is the robot, put at the origin; the rest is scenery
     exclude: tuple[tuple[str, str], ...] = ()  # bodies that only touch as the hulls of their meshes
     hulls: bool = False  # collide the visual meshes, not the shipped shapes, which leave gaps
+    tool: "_Source | None" = None  # what the robot holds, mounted at ``tool_site``
+    tool_site: str = "attachment_site"
 
 
 _MENAGERIE = "mujoco-menagerie, or point MENAGERIE_ROOT at a checkout of MuJoCo Menagerie"
+_ROBOTIQ_2F85 = _Source(
+    packages={"gym_hil": "assets/panda.xml"},  # a Panda that holds one
+    menagerie=("robotiq_2f85", "2f85.xml"),
+    install="--no-deps gym-hil==0.1.14",
+    freeze={},  # rigid, and open
+    root="base_mount",
+)
 _SOURCES = {
     "panda": _Source(
         packages={"genesis": "assets/xml/franka_emika_panda/panda.xml"},
@@ -45,6 +54,7 @@ _SOURCES = {
         install=_MENAGERIE,
         freeze={},
         hulls=True,
+        tool=_ROBOTIQ_2F85,  # a bare flange turns without being seen
     ),
     "fetch": _Source(
         packages={"gymnasium_robotics": "envs/assets/fetch/reach.xml"},
@@ -68,7 +78,9 @@ _SOURCES = {
 def install_hint(mesh_source: str | None) -> str:
     """What to pip install for the true geometry of a robot."""
     source = _SOURCES.get(str(mesh_source))
-    return source.install if source else _MENAGERIE
+    if source is None:
+        return _MENAGERIE
+    return f"{source.install}, and {source.tool.install}" if source.tool else source.install
 
 
 def mesh_spec(robot: "Robot", *, visuals: bool = True) -> mujoco.MjSpec | None:
@@ -96,6 +108,11 @@ def mesh_spec(robot: "Robot", *, visuals: bool = True) -> mujoco.MjSpec | None:
     fixed = source.freeze if source else {}
     if source and source.root:
         mjcf.keep_body(spec, source.root)
+    if source and source.tool and source.tool.root:
+        tool_path = tool_file(robot.mesh_source)
+        if tool_path is None:
+            return None
+        mjcf.mount(spec, source.tool_site, mjcf.read_spec(tool_path), source.tool.root)
     if source and source.hulls:
         mjcf.collide_visuals(spec)
     mjcf.strip_spec(spec, visuals=visuals)
@@ -126,7 +143,16 @@ def mesh_file(mesh_source: str | None) -> Path | None:
         return None
     if mesh_source not in _SOURCES:
         return Path(mesh_source)
-    source = _SOURCES[mesh_source]
+    return _found(_SOURCES[mesh_source])
+
+
+def tool_file(mesh_source: str | None) -> Path | None:
+    """The file with the true geometry of what a packaged robot holds, found likewise, or None."""
+    source = _SOURCES.get(str(mesh_source))
+    return _found(source.tool) if source and source.tool else None
+
+
+def _found(source: _Source) -> Path | None:
     return _in_root(source) or _cached(source) or _in_packages(source) or _downloaded(source)
 
 

@@ -53,6 +53,7 @@ class FitConfig:
     distance: tuple[float, float] = (1.5, 2.6)
     target_spread: float = 0.15
     learning_rate: float = 0.1
+    detail: float = 1.0  # times the levels' numbers of splats; large robots need more
     levels: tuple[LevelConfig, ...] = (
         LevelConfig(num_splats=300, size_px=32, steps=1000, batch=8),
         LevelConfig(num_splats=600, size_px=64, steps=1500, batch=6),
@@ -98,6 +99,7 @@ def fit_self_model(robot, spec: mujoco.MjSpec, path: str | Path, *, seed: int, c
     held_out, _ = _cached_images(robot, spec, config, work / "held_out.npz", seed + 1)
     levels = []
     for level in config.levels:
+        level = dataclasses.replace(level, num_splats=round(config.detail * level.num_splats))
         levels.append(_fit_level(robot, train, held_out, points, level, config, work, seed))
     model = SelfModel(
         robot=robot.name,
@@ -256,7 +258,7 @@ def initial_splats(points: np.ndarray, num_splats: int, seed: int) -> SplatModel
     rng = np.random.default_rng(seed)
     links, counts = np.unique(points[:, 0].astype(int), return_counts=True)
     # The square root keeps small but telling links, such as fingers, from starving.
-    shares = np.sqrt(counts) * np.cbrt(counts)
+    shares = np.sqrt(counts)  # small links tell more of the pose than their pixels do
     quota = np.maximum(8, np.floor(shares / shares.sum() * num_splats)).astype(int)
     quota[np.argmax(quota)] += num_splats - quota.sum()
     mean, radius, rgb, link = [], [], [], []
