@@ -39,6 +39,7 @@ RANGES = {
     "probe_radius": (0.0, np.inf),
     "probe_px": (8, 4096),
     "hypotheses": (0, 1024),
+    "attempts": (1, 1024),
     "polish_lanes": (3, 1024),
     "polish_px": (8, 4096),
     "polish_kept": (1, 1024),

@@ -47,7 +47,8 @@ class PlannerConfig:
     patience: int | None = 100  # iterations without improvement after which it gives up
     min_improvement: float = 0.0  # an improvement is a loss this much smaller ...
     min_ratio: float = 0.97  # ... and below this share of the one before
-    time_limit_s: float = float("inf")  # of the search, compilation excluded [s]
+    attempts: int = 2  # searches, the later ones from other probes, while nothing matches
+    time_limit_s: float = float("inf")  # of all searches, compilation excluded [s]
     connect_iterations: int = 200  # of RRT-Connect, to a match that the tree has not reached
     shortcut_rounds: int = 150
     verify_step: float = 0.005  # [rad]
@@ -61,7 +62,7 @@ class PlannerConfig:
 
         It searches until the loss has not improved for 100 iterations, matched or not.
         """
-        paper = {"probes": 0, "hypotheses": 0, "anneal": 0.0, "settle": 100}
+        paper = {"probes": 0, "hypotheses": 0, "anneal": 0.0, "settle": 100, "attempts": 1}
         paper |= {"min_improvement": 1e-4, "min_ratio": 1.0}
         return cls(**{**paper, **changes})
 

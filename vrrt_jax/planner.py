@@ -14,10 +14,11 @@ from vrrt_jax.config import PlannerConfig, PlanResult
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.rrt import RRT, RRTConnect, connection_path, tree_path
 from vrrt_jax.core.search import make_stop, search
+from vrrt_jax.core.types import Status
 from vrrt_jax.core.world import World
 from vrrt_jax.finish import finish, finish_visual, timed
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.sight import Sight, visual_setup, visual_stop
+from vrrt_jax.sight import Setup, Sight, visual_setup, visual_stop
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera
 from vrrt_jax.visual import plant
@@ -70,6 +71,30 @@ def plan(
     roots = q_start[None]
     if q_guess is not None:
         roots = np.stack([q_start, checks.check_limits(robot, q_guess, "guess")])
+    result = _attempt(robot, world, setup, roots, key, config, on_progress)
+    for again in range(1, config.attempts):
+        left_s = config.time_limit_s - result.timing["search_s"]
+        if result.status is not Status.NO_MATCH or left_s <= 0:
+            break
+        key = jax.random.fold_in(key, PLANTING - again)
+        rest = dataclasses.replace(config, time_limit_s=left_s)
+        other = _attempt(robot, world, setup, roots, key, rest, on_progress)
+        best = min(result, other, key=lambda r: r.loss)
+        spent = {name: result.timing[name] + other.timing[name] for name in result.timing}
+        result = dataclasses.replace(best, timing=spent)
+    return result
+
+
+def _attempt(
+    robot: Robot,
+    world: World,
+    setup: Setup,
+    roots: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+    on_progress: Callable[..., Any] | None,
+) -> PlanResult:
+    """Probe around the start (the first of the roots), search and finish, once."""
     seeds = (setup.policy, setup.probing, jnp.asarray(roots), jax.random.fold_in(key, PLANTING))
     tree, compile_s, plant_s = timed(_plant, world, *seeds, config.capacity)
     found = search(
@@ -84,7 +109,7 @@ def plan(
     found = dataclasses.replace(
         found, compile_s=found.compile_s + compile_s, search_s=found.search_s + plant_s
     )
-    ends = (setup.goal_loss, setup.polishing, q_start)
+    ends = (setup.goal_loss, setup.polishing, roots[0])
     return finish_visual(robot, world, found, *ends, key, config)
 
 
@@ -102,8 +127,9 @@ def plan_batch(
 ) -> list[PlanResult]:
     """Solve Q problems of one robot, world and camera at once, by an outer ``vmap``.
 
-    Problem ``i`` uses the key ``fold_in(key, i)``. The search times reported are those of the whole
-    batch. On a CPU a loop over :func:`plan` is as fast; on other devices the batch pays.
+    Problem ``i`` uses the key ``fold_in(key, i)``; each has one attempt. The search times reported
+    are those of the whole batch. On a CPU a loop over :func:`plan` is as fast; on other devices the
+    batch pays.
 
     Args:
         robot: from :func:`load_robot`.
