@@ -35,8 +35,8 @@ class PlannerConfig:
     hypotheses: int = 4  # matches that are polished on a larger image; 0 = none
     polish_lanes: int = 8  # samples of each, along what the image leaves open
     polish_px: int = 128  # height of that image (re-compiles)
-    polish_kept: int = 6  # best of all samples
-    polish_steps: tuple[int, int] = (4, 8)  # Levenberg-Marquardt, of all and further of the best
+    polish_rounds: int = 3  # of spreading ever less widely, and descending
+    polish_steps: int = 4  # Levenberg-Marquardt, in each round
     polish_reach: float = 1.5  # how far the samples spread at most [rad]
     start_prior: float = 0.005  # goal losses that a radian from the start costs there
     inherit: bool = True  # a child goes on with its parent's Adam moments

@@ -17,7 +17,7 @@ from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import Rejection, Status
 from vrrt_jax.core.verify import verify_path
 from vrrt_jax.core.world import World, obstacle_list
-from vrrt_jax.polish import LANES, Polishing, look_at, polish
+from vrrt_jax.polish import DISTINCT, LANES, Polishing, look_at, polish
 from vrrt_jax.robots.robot import Robot
 
 STATUS_OF = {
@@ -28,7 +28,6 @@ STATUS_OF = {
     Stopped.INTERRUPTED: Status.INTERRUPTED,
 }
 TRIED = 3  # matched configurations that are tried before there is no path
-DISTINCT = 0.3  # [rad] distance at which they count as different
 SAME_LOSS = 1.05  # losses within this factor are the same match
 
 

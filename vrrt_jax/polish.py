@@ -26,6 +26,7 @@ PROBE = 0.01  # [rad] step of the finite differences
 OTHERS = 0.5  # standard deviations that samples spread along all but the weakest direction
 RIDGE = 1e-7  # keeps joints that no pixel sees where they are
 LONGEST = 0.3  # [rad] of one step of a joint
+DISTINCT = 0.3  # [rad] distance at which configurations count as different
 
 
 @pytree
@@ -43,11 +44,12 @@ class Polishing:
 
     closer: Closer
     goal_loss: float  # that counts as matched there
-    slack: float  # how much loss the spread of samples may add, to second order
+    slack: float  # how much loss the first spread of samples may add, to second order
     reach: float  # how far they spread at most [rad]
     lanes: int  # samples of each configuration, itself and half a turn among them
-    kept: int  # the best of all samples
-    steps: tuple[int, int]  # of all samples, and further ones of the best
+    kept: int  # distinct configurations that leave a round
+    rounds: int  # of spreading and descending, each with a third of the slack of the one before
+    steps: int  # that a round descends
 
 
 class _Look(NamedTuple):
@@ -67,27 +69,39 @@ def polish(
     """Spread configurations (H, D) and descend.
 
     Returns:
-        Configurations (kept, D), best first, and their image losses; infinite in collision.
+        Distinct configurations (at most kept, D), best first, and their image losses; infinite in
+        collision.
     """
     rng = np.random.default_rng(seed)
-    samples = _look(world, polishing, _spread(_look(world, polishing, q), polishing, rng))
-    samples = _descend(world, polishing, samples, polishing.steps[0])
-    kept = _first(samples, samples.cost, polishing.kept)
-    kept = _descend(world, polishing, kept, polishing.steps[1])
-    kept = _first(kept, np.where(kept.free, kept.cost, np.inf), polishing.kept)
+    kept = _look(world, polishing, q)
+    for k in range(polishing.rounds):
+        samples = _look(world, polishing, _spread(kept, polishing, polishing.slack / 3.0**k, rng))
+        best = _rows(samples, np.argsort(samples.cost, kind="stable")[:LANES])
+        best = _descend(world, polishing, best, polishing.steps)
+        kept = _rows(best, _distinct(best, polishing.kept))
+    kept = _rows(kept, np.argsort(np.where(kept.free, kept.cost, np.inf), kind="stable"))
     return kept.q, np.where(kept.free, kept.loss, np.inf)
 
 
-def _first(look: _Look, cost: np.ndarray, num: int) -> _Look:
-    """Those of lowest cost, in order."""
-    order = np.argsort(cost, kind="stable")[:num]
-    return _Look(*(column[order] for column in look))
+def _rows(look: _Look, rows: np.ndarray) -> _Look:
+    return _Look(*(column[rows] for column in look))
 
 
-def _spread(near: _Look, polishing: Polishing, rng: np.random.Generator) -> np.ndarray:
+def _distinct(look: _Look, num: int) -> np.ndarray:
+    """Rows (at most num,) by rising cost, of those that are near each other only the first."""
+    kept: list[int] = []
+    for k in np.argsort(look.cost, kind="stable"):
+        if np.all(np.linalg.norm(look.q[kept] - look.q[k], axis=1) > DISTINCT):
+            kept.append(k)
+    return np.array(kept[:num])
+
+
+def _spread(
+    near: _Look, polishing: Polishing, slack: float, rng: np.random.Generator
+) -> np.ndarray:
     """Samples (H * lanes, D) along the directions that the image tells little about."""
     values, vectors = np.linalg.eigh(2.0 * near.matrix)  # rising
-    reach = np.minimum(np.sqrt(2.0 * polishing.slack / np.maximum(values, 1e-9)), polishing.reach)
+    reach = np.minimum(np.sqrt(2.0 * slack / np.maximum(values, 1e-9)), polishing.reach)
     num, joints = polishing.lanes - 2, near.q.shape[1]
     along = OTHERS * rng.normal(size=(len(near.q), num, joints))
     along[:, :, 0] = np.linspace(-1.0, 1.0, num)
@@ -101,7 +115,7 @@ def _spread(near: _Look, polishing: Polishing, rng: np.random.Generator) -> np.n
 
 def _descend(world: World, polishing: Polishing, now: _Look, steps: int) -> _Look:
     """Levenberg-Marquardt: steps that lower the cost; those that do not raise the damping."""
-    damping = np.full(len(now.q), 1e-2)
+    damping = np.full(len(now.q), 1e-3)
     for _ in range(steps):
         diagonal = np.einsum("nii->ni", now.matrix)
         ridge = damping[:, None] * diagonal + RIDGE

@@ -136,7 +136,8 @@ def visual_polishing(
         slack=POLISH_SLACK * goal_loss,
         reach=config.polish_reach,
         lanes=config.polish_lanes,
-        kept=config.polish_kept,
+        kept=config.hypotheses,
+        rounds=config.polish_rounds,
         steps=config.polish_steps,
     )
 
