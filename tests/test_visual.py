@@ -13,8 +13,9 @@ import optax
 import pytest
 
 import vrrt_jax
-from vrrt_jax import planner
+from vrrt_jax import finish, planner
 from vrrt_jax.core import search as searches
+from vrrt_jax.core import tree as trees
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.rewire import with_costs
 from vrrt_jax.core.tree import UNREACHED, lineage
@@ -282,6 +283,35 @@ def test_polishing_turns_the_wrist_back(panda, self_model, camera, open_world):
 
 def _hand_position(panda, q):
     return np.asarray(vrrt_jax.link_poses(panda.chain, jnp.asarray(q)))[-1, :3, 3].tolist()
+
+
+def test_ambiguous_goals_are_told(panda, self_model, camera, open_world):
+    """With a slack bar, the hand after half a turn matches too: both ends are named."""
+    image = picture(panda, self_model, camera, Q_GOAL, level=2)
+    config = planner.PlannerConfig(match_scale=20.0, polish_rounds=1)
+    setup = visual_setup(Sight(panda, self_model, camera, image), Q_START, config)
+    twin = Q_GOAL - np.pi * np.sign(Q_GOAL[6]) * np.eye(7, dtype=np.float32)[6]
+    roots = jnp.asarray(np.stack([Q_START, Q_GOAL, twin]))
+    score, payload = setup.policy.roots(open_world, roots)
+    tree = trees.create(roots, score, payload, config.capacity)
+    found = searches.SearchResult(
+        tree=tree,
+        stopped=searches.Stopped.REACHED,
+        history=np.zeros((1, 4)),
+        compile_s=0.0,
+        search_s=0.0,
+    )
+    ends = (setup.goal_loss, setup.polishing, Q_START)
+    result = finish.finish_visual(panda, open_world, found, *ends, jax.random.key(0), config)
+    assert result.ok
+    np.testing.assert_allclose(result.target, Q_GOAL, atol=0.02)
+    assert len(result.alternatives) == 0  # an exact image tells them apart
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(finish, "ALIKE", np.inf)
+        result = finish.finish_visual(panda, open_world, found, *ends, jax.random.key(0), config)
+    apart = np.abs(result.alternatives - twin).max(axis=1)
+    assert len(apart) >= 1 and apart.min() < 0.3
+    assert f"ambiguous: {len(apart)} other" in str(result)
 
 
 def test_another_attempt_while_nothing_matches(panda, self_model, camera, image, open_world):

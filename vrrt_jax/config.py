@@ -75,6 +75,7 @@ class PlanResult:
     path: np.ndarray  # (P, D) the shortened, verified path; of a failure, the best attempt
     raw_path: np.ndarray  # (P', D) as the tree has it
     target: np.ndarray  # (D,) what was planned to: the end of the path, unless there is none
+    alternatives: np.ndarray  # (A, D) other configurations that match the image as well
     loss: float  # of the target: image loss, or distance to a joint goal [rad]
     goal_loss: float  # at or below which it counts as matched
     cost: float  # length of ``path`` [rad]
@@ -98,8 +99,10 @@ class PlanResult:
     def __str__(self) -> str:
         """One line for people."""
         times = ", ".join(f"{k.removesuffix('_s')} {v:.1f} s" for k, v in self.timing.items())
+        others = len(self.alternatives)
+        ambiguous = f"; ambiguous: {others} other configurations look the same" if others else ""
         return (
             f"{self.status.name}: loss {self.loss:.2e} (goal {self.goal_loss:.2e}), "
             f"{len(self.path)} waypoints, {self.cost:.2f} rad, {self.iterations} iterations; "
-            f"{times}"
+            f"{times}{ambiguous}"
         )

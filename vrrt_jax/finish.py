@@ -29,6 +29,7 @@ STATUS_OF = {
 }
 TRIED = 3  # matched configurations that are tried before there is no path
 SAME_LOSS = 1.05  # losses within this factor are the same match
+ALIKE = 1.1  # and within this factor the image does not tell which it is
 
 
 def finish_visual(
@@ -60,13 +61,14 @@ def finish_visual(
         nodes = list(_distinct(world, score, q, q_start, config.hypotheses, np.inf))
         found, (q, score) = _polished(found, world, polishing, q[nodes], key)
         ends = [k for k in range(len(q)) if np.isfinite(score[k])] or [0]
-        paths = {}
+        paths, rivals = {}, ends
     else:
         if hurried and score.min() > goal_loss:  # nothing matches: the best that a path leads to
             score = np.where(np.asarray(found.tree.cost) < trees.UNREACHED, score, np.inf)
         ends = list(_distinct(world, score, q, q_start, TRIED, goal_loss))
         paths = {end: tree_path(found.tree, end) for end in ends}
         paths = {end: path for end, path in paths.items() if np.array_equal(path[0], q_start)}
+        rivals = []  # on a small image even neighbours look the same
     for end in ends[:TRIED]:
         path = paths.get(end)
         if path is None:
@@ -76,7 +78,9 @@ def finish_visual(
     else:
         end, path = ends[0], None
     target, loss = q[end], float(score[end])
-    return finish(robot, world, found, path, target, loss, goal_loss, key, config, q_start)
+    alike = [k for k in rivals if k != end and score[k] <= min(ALIKE * loss, goal_loss)]
+    result = finish(robot, world, found, path, target, loss, goal_loss, key, config, q_start)
+    return dataclasses.replace(result, alternatives=q[alike])
 
 
 def _distinct(
@@ -201,6 +205,7 @@ def finish(
         path=path,
         raw_path=raw_path,
         target=target,
+        alternatives=target[None][:0],
         loss=loss,
         goal_loss=goal_loss,
         cost=path_length(world, path),

@@ -34,6 +34,7 @@ def summary(
         "cost": result.cost,
         "raw_cost": float(np.linalg.norm(np.diff(result.raw_path, axis=0), axis=1).sum()),
         "q_goal": [round(float(v), 6) for v in result.q_goal],
+        "alternatives": np.round(result.alternatives, 6).tolist(),
         "timing": {name: round(value, 4) for name, value in result.timing.items()},
         "counts": {
             "iterations": result.iterations,
