@@ -192,14 +192,16 @@ def test_page_has_tables_and_figures(tmp_path):
         tables.write_page([page], tmp_path)
 
 
-def test_ablations_vary_one_setting_each():
-    paper = vrrt_jax.PlannerConfig.paper(time_limit_s=60.0)
+@pytest.mark.parametrize("config", ["paper", "default"])
+def test_ablations_vary_one_setting_each(config):
+    make = {"paper": vrrt_jax.PlannerConfig.paper, "default": vrrt_jax.PlannerConfig}[config]
+    base = make(time_limit_s=60.0)
     variants = protocol.benchmark(
-        "ablation", "panda", levels=(1.5,), tasks_per_level=1, seed=0
+        "ablation", "panda", levels=(1.5,), tasks_per_level=1, seed=0, config=config
     ).variants
     assert len({variant.name for variant in variants}) == len(variants)
     for variant in variants:
-        a, b = dataclasses.asdict(variant.config), dataclasses.asdict(paper)
+        a, b = dataclasses.asdict(variant.config), dataclasses.asdict(base)
         assert sum(a[name] != b[name] for name in a) <= 1
 
 

@@ -77,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     for what, words in (
         ("visual", "the paper's tasks, among obstacles"),
         ("pose", "recover the goal alone, without obstacles"),
-        ("ablation", "the paper's settings, varied one by one"),
+        ("ablation", "the settings, varied one by one"),
     ):
         _add_protocol(kinds.add_parser(what, help=words), what)
 
@@ -103,6 +103,7 @@ def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument("--seed", type=int, default=0)
     if what == "ablation":
         parser.add_argument("--only", help="one setting, such as eta; all by default")
+        parser.add_argument("--config", default="paper", help="whose settings: paper or default")
     else:
         parser.add_argument("--method", default="vrrt", help="vrrt, dr-robot, prof-robot, ...")
         parser.add_argument("--config", default="default", help="default or paper")

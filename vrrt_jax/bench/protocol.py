@@ -8,15 +8,28 @@ from vrrt_jax.bench.runner import Benchmark, Variant
 from vrrt_jax.bench.tasks import ROBOTS, Scenery
 from vrrt_jax.config import PlannerConfig
 
-# Each against the paper's settings; the values that the paper varies.
+# By the settings that are varied, one by one. Of the paper's, the values that the paper varies; of
+# the default, what it does and the paper does not: each is taken away, after the whole.
 ABLATIONS = {
-    "exploration": (0.1, 0.3, 0.5, 0.7, 0.9),
-    "eta": (0.0, 0.2, 0.4, 0.6, 0.8, 1.0),
-    "kappa": (0.5, 0.8, 0.9, 0.95, 0.99),
-    "beta1": (0.5, 0.9, 0.99),
-    "beta2": (0.9, 0.999),
-    "lanes": (8, 32, 128),
-    "inherit": (True, False),
+    "paper": {
+        "exploration": (0.1, 0.3, 0.5, 0.7, 0.9),
+        "eta": (0.0, 0.2, 0.4, 0.6, 0.8, 1.0),
+        "kappa": (0.5, 0.8, 0.9, 0.95, 0.99),
+        "beta1": (0.5, 0.9, 0.99),
+        "beta2": (0.9, 0.999),
+        "lanes": (8, 32, 128),
+        "inherit": (True, False),
+    },
+    "default": {
+        "probes": (1024, 256, 0),
+        "probe_steps": (0,),
+        "hypotheses": (0, 1),
+        "polish_rounds": (1,),
+        "start_prior": (0.0,),
+        "anneal": (0.0,),
+        "attempts": (1,),
+        "settle": (0,),
+    },
 }
 GUESS_SIGMAS = (0.05, 0.10, 0.15, 0.20)  # [rad]
 
@@ -43,8 +56,8 @@ def benchmark(
         tasks_per_level: number of tasks at each.
         seed: of tasks and method.
         method: one of :data:`~vrrt_jax.bench.methods.METHODS`.
-        config: "default" or "paper"; ablations vary the paper's.
-        only: one of the ablations, all of them if None.
+        config: "default" or "paper"; what an ablation varies.
+        only: one of its settings, all of them if None.
         scenery: what goal images look like.
         time_limit_s: of one search [s].
 
@@ -55,10 +68,11 @@ def benchmark(
         ("robot", robot, ROBOTS),
         ("method", method, METHODS),
         ("config", config, CONFIGS),
-        ("ablation", only or "eta", (*ABLATIONS, "guess")),
+        ("ablation", only, (None, *ABLATIONS.get(config, ()), "guess")),
     ):
         if value not in known:
-            raise ValueError(f"unknown {name} '{value}'; have: {', '.join(known)}")
+            names = ", ".join(str(n) for n in known if n is not None)
+            raise ValueError(f"unknown {name} '{value}'; have: {names}")
     if tasks_per_level < 1 or not levels or min(levels) <= 0:
         raise ValueError(
             f"got levels {list(levels)} and {tasks_per_level} tasks a level; expected distances "
@@ -72,22 +86,20 @@ def benchmark(
         levels=tuple(levels),
         tasks_per_level=tasks_per_level,
         seed=seed,
-        variants=_ablations(only, time_limit_s) if what == "ablation" else (base,),
+        variants=_ablations(config, only, base.config) if what == "ablation" else (base,),
         scenery=scenery or Scenery(),
     )
 
 
-def _ablations(only: str | None, time_limit_s: float) -> tuple[Variant, ...]:
-    paper = PlannerConfig.paper(time_limit_s=time_limit_s)
+def _ablations(config: str, only: str | None, base: PlannerConfig) -> tuple[Variant, ...]:
     variants = [
-        Variant(name=f"{field}={value}", config=dataclasses.replace(paper, **{field: value}))
-        for field, values in ABLATIONS.items()
+        Variant(name=f"{field}={value}", config=dataclasses.replace(base, **{field: value}))
+        for field, values in ABLATIONS[config].items()
         if only in (None, field)
         for value in values
     ]
     if only in (None, "guess"):
         variants += [
-            Variant(name=f"guess={sigma}", config=paper, guess_sigma=sigma)
-            for sigma in GUESS_SIGMAS
+            Variant(name=f"guess={sigma}", config=base, guess_sigma=sigma) for sigma in GUESS_SIGMAS
         ]
     return tuple(variants)
