@@ -47,7 +47,7 @@ class PlannerConfig:
     patience: int | None = 100  # iterations without improvement after which it gives up
     min_improvement: float = 0.0  # an improvement is a loss this much smaller ...
     min_ratio: float = 0.97  # ... and below this share of the one before
-    attempts: int = 2  # searches, the later ones from other probes, while nothing matches
+    attempts: int = 2  # the later ones from other probes, while no path is found and verified
     time_limit_s: float = float("inf")  # of all searches, compilation excluded [s]
     connect_iterations: int = 200  # of RRT-Connect, to a match that the tree has not reached
     shortcut_rounds: int = 150

@@ -24,6 +24,7 @@ from vrrt_jax.splat.types import Camera
 from vrrt_jax.visual import plant
 
 PLANTING = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
+AGAIN = (Status.NO_MATCH, Status.NO_PATH, Status.NOT_VERIFIED)  # worth another attempt
 RRT_STAR_RADIUS = 1.9  # [rad] nodes of a sparse tree in seven dimensions lie that far apart
 
 _plant = jax.jit(plant, static_argnums=5)
@@ -74,12 +75,12 @@ def plan(
     result = _attempt(robot, world, setup, roots, key, config, on_progress)
     for again in range(1, config.attempts):
         left_s = config.time_limit_s - result.timing["search_s"]
-        if result.status is not Status.NO_MATCH or left_s <= 0:
+        if result.status not in AGAIN or left_s <= 0:
             break
         key = jax.random.fold_in(key, PLANTING - again)
         rest = dataclasses.replace(config, time_limit_s=left_s)
         other = _attempt(robot, world, setup, roots, key, rest, on_progress)
-        best = min(result, other, key=lambda r: r.loss)
+        best = min(result, other, key=lambda r: (not r.ok, r.loss))
         spent = {name: result.timing[name] + other.timing[name] for name in result.timing}
         result = dataclasses.replace(best, timing=spent)
     return result
