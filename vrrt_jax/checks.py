@@ -46,6 +46,7 @@ RANGES = {
     "polish_steps": (0, 1024),
     "polish_reach": (0.0, np.inf),
     "start_prior": (0.0, np.inf),
+    "start_preference": (0.0, np.inf),
     "probe_alpha": (0.0, 1.0),
     "probe_steps": (0, 100_000),
     "lanes": (1, 4096),

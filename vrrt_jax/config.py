@@ -39,6 +39,7 @@ class PlannerConfig:
     polish_steps: int = 4  # Levenberg-Marquardt, in each round
     polish_reach: float = 1.5  # how far the samples spread at most [rad]
     start_prior: float = 0.005  # goal losses that a radian from the start costs there
+    start_preference: float = 0.015  # share of the loss that a squared radian from it counts for
     inherit: bool = True  # a child goes on with its parent's Adam moments
     rewiring: bool = True  # RRT*
     rewire_radius: float = 0.3  # [rad]

@@ -60,7 +60,9 @@ def finish_visual(
         goal_loss = polishing.goal_loss
         nodes = list(_distinct(world, score, q, q_start, config.hypotheses, np.inf))
         found, (q, score) = _polished(found, world, polishing, q[nodes], key)
-        ends = [k for k in range(len(q)) if np.isfinite(score[k])] or [0]
+        far = _apart(world, q, q_start) ** 2  # of two that look alike, the nearer is likelier
+        order = np.argsort(score * (1.0 + config.start_preference * far), kind="stable")
+        ends = [int(k) for k in order if np.isfinite(score[k])] or [0]
         paths, rivals = {}, ends
     else:
         if hurried and score.min() > goal_loss:  # nothing matches: the best that a path leads to
@@ -92,21 +94,22 @@ def _distinct(
     goal_loss: float,
 ) -> Iterator[int]:
     """Where to end: as good as the best, nearest to the start first; then other matches."""
-    wraps = np.asarray(world.wraps)
-
-    def apart(nodes: np.ndarray, q_other: np.ndarray) -> np.ndarray:
-        step = q[nodes] - q_other
-        return np.linalg.norm(step - 2 * np.pi * np.round(step / (2 * np.pi)) * wraps, axis=1)
-
     open_nodes = np.flatnonzero(np.isfinite(score) & (score <= max(goal_loss, score.min())))
     for _ in range(most):
         if len(open_nodes) == 0:
             return
         # Nodes just under the bar would be nearer still, but only as they are not there yet.
         equal = open_nodes[score[open_nodes] <= SAME_LOSS * score[open_nodes].min()]
-        best = int(equal[np.argmin(apart(equal, q_start))])
+        best = int(equal[np.argmin(_apart(world, q[equal], q_start))])
         yield best
-        open_nodes = open_nodes[apart(open_nodes, q[best]) > DISTINCT]
+        open_nodes = open_nodes[_apart(world, q[open_nodes], q[best]) > DISTINCT]
+
+
+def _apart(world: World, q: np.ndarray, q_other: np.ndarray) -> np.ndarray:
+    """Distances (n,) of configurations (n, D) from another (D,), the short way round."""
+    step = q - q_other
+    turns = np.round(step / (2 * np.pi)) * np.asarray(world.wraps)
+    return np.linalg.norm(step - 2 * np.pi * turns, axis=1)
 
 
 def _connected(

@@ -26,6 +26,7 @@ ABLATIONS = {
         "hypotheses": (0, 1),
         "polish_rounds": (1,),
         "start_prior": (0.0,),
+        "start_preference": (0.0,),
         "anneal": (0.0,),
         "attempts": (1,),
         "settle": (0,),
