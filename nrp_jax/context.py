@@ -9,41 +9,46 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-WINDOW_CELLS = 40
+SIDE = 40  # cells
 
 
-def pad(occupied: np.ndarray, outside: float = True) -> jax.Array:
+def pad(occupied: np.ndarray) -> jax.Array:
     """A map (X, Y, Z) with a border of occupied cells, for :func:`window`; do this once a map."""
-    border = (
-        (WINDOW_CELLS // 2, WINDOW_CELLS // 2),
-        (WINDOW_CELLS // 2, WINDOW_CELLS // 2),
-        (0, 0),
-    )
-    return jnp.asarray(np.pad(occupied, border, constant_values=outside))
+    border = ((SIDE // 2,) * 2, (SIDE // 2,) * 2, (0, 0))
+    return jnp.asarray(np.pad(occupied, border, constant_values=True))
 
 
-def window_centre(q: jax.Array, resolution=0.1, origin=(0.0, 0.0)) -> jax.Array:
-    """Place (..., 2) [m] of the windows' centres for ``q`` (..., D): origins of local frames.
-
-    The corner of cells nearest to the base; ``origin`` is the corner of the map's first cell [m].
-    """
-    origin = jnp.asarray(origin, q.dtype)[..., :2]
-    return jnp.round((q[..., :2] - origin) / resolution) * resolution + origin
+def centre_cell(q: jax.Array, resolution=0.1, origin=(0.0, 0.0)) -> jax.Array:
+    """Corner of cells (..., 2) i32 nearest to the base at ``q`` (..., D), from the map's origin."""
+    place = q[..., :2] - jnp.asarray(origin, q.dtype)[..., :2]
+    return jnp.round(place / resolution).astype(jnp.int32)
 
 
-def window(padded: jax.Array, resolution, q: jax.Array, origin=(0.0, 0.0)) -> jax.Array:
+def centre(q: jax.Array, resolution=0.1, origin=(0.0, 0.0)) -> jax.Array:
+    """Place (..., 2) [m] of the window's centre in the map: the origin of the local frame."""
+    cell = centre_cell(q, resolution, origin)
+    return cell * resolution + jnp.asarray(origin, q.dtype)[..., :2]
+
+
+def window(padded: jax.Array, q: jax.Array, resolution=0.1, origin=(0.0, 0.0)) -> jax.Array:
     """The window (40, 40, Z) around ``q`` (D,); vmappable.
 
     Args:
         padded: from :func:`pad`, (X + 40, Y + 40, Z).
-        resolution: side of a cell [m].
         q: (D,) configuration whose base, its first two joints, is in the map [m].
+        resolution: side of a cell [m].
         origin: place of the corner of the map's first cell [m].
     """
-    place = (q[:2] - jnp.asarray(origin, q.dtype)[:2]) / resolution
-    first = jnp.round(place).astype(jnp.int32)  # the border shifts it by half a window, and back
-    size = (WINDOW_CELLS, WINDOW_CELLS, padded.shape[2])
-    return jax.lax.dynamic_slice(padded, (first[0], first[1], 0), size)
+    corner = centre_cell(q, resolution, origin)  # the border shifts it by half a window, and back
+    size = (SIDE, SIDE, padded.shape[2])
+    return jax.lax.dynamic_slice(padded, (corner[0], corner[1], 0), size)
 
 
-windows = jax.jit(jax.vmap(window, (None, None, 0, None)))  # of q (n, D): (n, 40, 40, Z)
+windows = jax.jit(jax.vmap(window, (None, 0, None, None)))  # of q (n, D): (n, 40, 40, Z)
+
+
+def stacked_window(padded: jax.Array, index: jax.Array, q: jax.Array, resolution=0.1) -> jax.Array:
+    """The window (40, 40, Z) around ``q`` in map ``index`` of several (H, X + 40, Y + 40, Z)."""
+    corner = centre_cell(q, resolution)
+    size = (1, SIDE, SIDE, padded.shape[3])
+    return jax.lax.dynamic_slice(padded, (index, corner[0], corner[1], 0), size)[0]
