@@ -1,0 +1,209 @@
+"""Rows of a data set as arrays on the device, and batches of them as the networks see them.
+
+Rows are grouped by query, so that a window is cut and encoded once for all its waypoints.
+Letters: ``Q`` queries, ``W`` waypoints of a query, ``H`` homes, ``n`` queries of a batch.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nrp_jax import context, features
+from nrp_jax.grid import Grid
+from nrp_jax.models import ModelConfig
+from nrp_jax.robots import MobileRobot, link_features
+from nrp_jax.world import GridWorld, build_world
+from vrrt_jax.core.types import pytree
+
+MAP_CELLS = {"snake": 100, "fetch": 150}  # side of the whole map, for models that see all of it
+
+
+@pytree
+class Examples:
+    """Training rows on the device."""
+
+    maps: jax.Array  # (H, X + 40, Y + 40, Z) float16, see :func:`surrounding_map`
+    home: jax.Array  # (Q,) i32
+    start: jax.Array  # (Q, D) in the world
+    goal: jax.Array  # (Q, D)
+    waypoints: jax.Array  # (Q, W, D)
+    target: jax.Array  # (Q, W) how good each waypoint is, 0 to 1
+    weight: jax.Array  # (Q, W) of the row in the loss, 0 where a query has fewer waypoints
+
+
+@pytree
+class Batch:
+    """What the networks see of n queries."""
+
+    image: jax.Array  # (n, X, Y, Z)
+    start: jax.Array  # (n, E)
+    goal: jax.Array  # (n, E')
+    waypoints: jax.Array  # (n, W, E'')
+    clearance: jax.Array  # (n, W, P)
+    target: jax.Array  # (n, W)
+    weight: jax.Array  # (n, W)
+
+
+def surrounding_map(config: ModelConfig, world: GridWorld) -> jax.Array:
+    """A world's map as the images are cut from it: (X + 40, Y + 40, Z), bordered by solid cells.
+
+    Distances to obstacles [m]; for the published models occupancies.
+    """
+    distances = features.surroundings(world.field, config.task == "snake")
+    half = context.WINDOW_CELLS // 2
+    border = ((half, half), (half, half), (0, 0))
+    distances = jnp.pad(distances, border)
+    return jnp.where(distances > 0, 0.0, 1.0) if config.paper else distances
+
+
+def view(
+    config: ModelConfig, padded: jax.Array, q: jax.Array, resolution: jax.Array, origin: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """What a model sees from a start ``q`` (D,): an image, and the place of its middle.
+
+    Args:
+        config: of the model; its scope says whether it sees a window or the whole map.
+        padded: from :func:`surrounding_map`.
+        q: (D,) start.
+        resolution: () side of a cell [m].
+        origin: (2,) corner of the map's first cell [m].
+
+    Returns:
+        The image (X', Y', Z); the origin (2,) of the local frame [m].
+    """
+    if config.scope == "window":
+        image = context.window(padded, resolution, q, origin)
+        return image, context.window_centre(q, resolution, origin)
+    side, half = MAP_CELLS[config.task], context.WINDOW_CELLS // 2
+    size = np.array(padded.shape[:2]) - 2 * half
+    excess = np.maximum(side - size, 0)  # maps may be smaller, or larger and then are cut
+    solid = 1.0 if config.paper else 0.0
+    image = jnp.pad(
+        padded[half:-half, half:-half],
+        [(excess[0] // 2, excess[0] - excess[0] // 2)]
+        + [(excess[1] // 2, excess[1] - excess[1] // 2), (0, 0)],
+        constant_values=solid,
+    )
+    first = np.maximum(size - side, 0) // 2
+    image = image[first[0] : first[0] + side, first[1] : first[1] + side]
+    corner = first - excess // 2
+    return image, origin[:2] + (jnp.asarray(corner) + side / 2) * resolution
+
+
+def make_examples(
+    config: ModelConfig,
+    robot: MobileRobot,
+    grids: Sequence[Grid],
+    rows: dict[str, np.ndarray],
+    *,
+    target: np.ndarray,
+    weight: np.ndarray,
+) -> Examples:
+    """Put rows on the device, grouped by query.
+
+    Args:
+        config: of the model to train.
+        robot: whose configurations they are.
+        grids: H homes; the frames of their maps begin at (0, 0).
+        rows: ``q_start``, ``q_goal``, ``waypoint`` (n, D), ``home`` and ``query`` (n,).
+        target: (n,) how good the waypoints are.
+        weight: (n,) in the loss.
+    """
+    maps = _stack([surrounding_map(config, build_world(robot, grid)) for grid in grids], config)
+    _, first, group, counts = np.unique(
+        rows["home"].astype(np.int64) << 32 | rows["query"].astype(np.int64),
+        return_index=True,
+        return_inverse=True,
+        return_counts=True,
+    )
+    order = np.argsort(group, kind="stable")
+    slot = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+    table = np.repeat(first[:, None], counts.max(), axis=1)  # empty slots repeat the first row
+    table[group[order], slot] = order
+    filled = np.arange(counts.max()) < counts[:, None]
+    return Examples(
+        maps=jnp.asarray(maps),
+        home=jnp.asarray(rows["home"][first], jnp.int32),
+        start=jnp.asarray(rows["q_start"][first], jnp.float32),
+        goal=jnp.asarray(rows["q_goal"][first], jnp.float32),
+        waypoints=jnp.asarray(rows["waypoint"][table], jnp.float32),
+        target=jnp.asarray(target[table], jnp.float32),
+        weight=jnp.asarray(weight[table] * filled, jnp.float32),
+    )
+
+
+def _stack(maps: list[jax.Array], config: ModelConfig) -> np.ndarray:
+    """Maps of several sizes as one array, filled up with solid cells."""
+    size = np.max([one.shape for one in maps], axis=0)
+    stacked = np.full((len(maps), *size), 1.0 if config.paper else 0.0, np.float16)
+    for into, one in zip(stacked, maps, strict=True):
+        into[: one.shape[0], : one.shape[1], : one.shape[2]] = np.asarray(one)
+    return stacked
+
+
+def make_batch(
+    config: ModelConfig,
+    robot: MobileRobot,
+    examples: Examples,
+    chosen: jax.Array,
+    key: jax.Array | None = None,
+) -> Batch:
+    """Images and features of chosen queries (n,); with a key each is turned and mirrored at random.
+
+    Homes have no preferred direction, so every query stands for eight.
+    """
+    image, start, goal, waypoints = jax.vmap(lambda index: _local(config, examples, index))(chosen)
+    if key is not None:
+        symmetry = jax.random.randint(key, (2, len(chosen)), 0, jnp.array([[4], [2]]))
+        quarter, mirror = symmetry[0], symmetry[1] == 1
+        image = jax.vmap(features.turn_image)(image, quarter, mirror)
+        turn = jax.vmap(lambda q, k, m: features.turn_configuration(robot, q, k, m))
+        start, goal, waypoints = (turn(q, quarter, mirror) for q in (start, goal, waypoints))
+    # One call of the kinematics: it is what takes longest to compile.
+    q = jnp.concatenate([start[:, None], goal[:, None], waypoints], axis=1)
+    points = jax.vmap(jax.vmap(lambda q: link_features(robot, q)))(q)
+    described = describe(config, robot, q, points)
+    return Batch(
+        image=image,
+        start=described[:, 0],
+        goal=jax.vmap(lambda q, p: features.goal_features(config, robot, q, p))(goal, points[:, 1]),
+        waypoints=described[:, 2:],
+        clearance=jax.vmap(lambda i, q, p: clearances(robot, i, q, p))(
+            image, waypoints, points[:, 2:]
+        ),
+        target=examples.target[chosen],
+        weight=examples.weight[chosen],
+    )
+
+
+def describe(
+    config: ModelConfig, robot: MobileRobot, q: jax.Array, points: jax.Array
+) -> jax.Array:
+    """Features (n, C, E) of local configurations (n, C, D) with link frames (n, C, F, 3)."""
+    one = functools.partial(features.configuration_features, config, robot)
+    return jax.vmap(jax.vmap(one))(q, points)
+
+
+def _local(config: ModelConfig, examples: Examples, index: jax.Array):
+    """Image, start, goal and waypoints of one query, in its local frame."""
+    home, q = examples.home[index], examples.start[index]
+    if config.scope == "window":
+        # One slice of the stack: ``maps[home]`` would copy a whole map for every row.
+        first = jnp.round(q[:2] / 0.1).astype(jnp.int32)
+        side = context.WINDOW_CELLS
+        size = (1, side, side, examples.maps.shape[3])
+        image = jax.lax.dynamic_slice(examples.maps, (home, first[0], first[1], 0), size)[0]
+        centre = context.window_centre(q)
+    else:
+        image, centre = view(config, examples.maps[home], q, jnp.float32(0.1), jnp.zeros(2))
+    ends = (q, examples.goal[index], examples.waypoints[index])
+    return image.astype(jnp.float32), *(features.to_local(end, centre) for end in ends)
+
+
+def clearances(robot: MobileRobot, image: jax.Array, q: jax.Array, points: jax.Array) -> jax.Array:
+    """What an image (X, Y, Z) holds where local waypoints (C, D), with frames, would be: (C, P)."""
+    touched = jax.vmap(lambda q, p: features.clearance_points(robot, q, p))(q, points)
+    return image.reshape(-1)[features.cells(touched, image.shape, 0.1)]

@@ -1,0 +1,331 @@
+"""Training of the discriminator and the CVAE."""
+
+import csv
+import dataclasses
+import functools
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import orbax.checkpoint as ocp
+import scipy.stats
+from tqdm import tqdm
+
+from nrp_jax import models
+from nrp_jax.checkpoint import Model, build_module, save_model
+from nrp_jax.examples import Batch, Examples, make_batch
+from nrp_jax.models import ModelConfig
+from nrp_jax.robots import MobileRobot
+from vrrt_jax.core.types import pytree
+
+COLUMNS = ("epoch", "train_loss", "loss", "quality", "seconds")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """How a model is trained."""
+
+    epochs: int = 60
+    batch: int = 64  # queries a step
+    learning_rate: float = 2e-3  # at its peak; then a cosine down to nothing
+    weight_decay: float = 1e-3
+    patience: int = 12  # epochs without a better validation loss, then training ends
+    augment: bool = True  # turn and mirror
+    validation: float = 0.15  # share of the homes that is held out
+    seed: int = 0
+
+
+@pytree
+class State:
+    """What changes as training goes on."""
+
+    variables: Any
+    optimiser: optax.OptState
+    step: jax.Array  # ()
+
+
+def train(
+    config: ModelConfig,
+    robot: MobileRobot,
+    examples: Examples,
+    out: str | Path,
+    *,
+    settings: TrainConfig = TrainConfig(),
+    stamp: str = "",
+    progress: bool = True,
+) -> Model:
+    """Train a model; an interrupted training goes on where its last whole epoch ended.
+
+    Args:
+        config: the architecture.
+        robot: whose configurations the examples hold.
+        examples: from :func:`nrp_jax.examples.load_examples`.
+        out: folder for ``model.npz`` (the best epoch), ``log.csv``, ``curves.png`` and
+            ``checkpoint/`` (the last epoch).
+        settings: of the optimiser.
+        stamp: names the data; a training goes on only with the same.
+        progress: show a bar.
+
+    Returns:
+        The model of the best epoch.
+
+    Raises:
+        ValueError: ``out`` holds a training of another model, data or settings, or there are too
+            few homes to hold some out.
+    """
+    out = _claim(Path(out), config, settings, stamp)
+    training, validation = split_by_home(np.asarray(examples.home), settings)
+    sample = make_batch(config, robot, examples, jnp.zeros(1, jnp.int32))
+    module = build_module(config, sample.waypoints.shape[-1])
+    steps = settings.epochs * (len(training) // settings.batch)
+    schedule = optax.warmup_cosine_decay_schedule(
+        0.0, settings.learning_rate, min(200, steps // 10 + 1), steps + 1
+    )
+    optimiser = optax.adamw(schedule, weight_decay=settings.weight_decay)
+    variables = init(config, module, sample, jax.random.key(settings.seed))
+    state = State(
+        variables=variables,
+        optimiser=optimiser.init(variables["params"]),
+        step=jnp.int32(0),
+    )
+    keeper = Keeper(out / "checkpoint")
+    state, best, history = keeper.restore(state)
+
+    def export() -> Model:
+        figures = {key: value for key, value in min(history, key=_loss).items()}
+        info = {"num_outputs": sample.waypoints.shape[-1], "data": stamp, "best": figures}
+        model = Model(config=config, variables=best, info=info)
+        save_model(model, out / "model.npz")
+        return model
+
+    @jax.jit
+    def update(state: State, examples: Examples, chosen: jax.Array):
+        key, key_turn = jax.random.split(
+            jax.random.fold_in(jax.random.key(settings.seed), state.step)
+        )
+        batch = make_batch(config, robot, examples, chosen, key_turn if settings.augment else None)
+
+        def objective(params):
+            variables = {**state.variables, "params": params}
+            return loss_fn(config, module, variables, batch, key, train=True)
+
+        (loss, (_, changed)), gradient = jax.value_and_grad(objective, has_aux=True)(
+            state.variables["params"]
+        )
+        updates, moments = optimiser.update(gradient, state.optimiser, state.variables["params"])
+        params = optax.apply_updates(state.variables["params"], updates)
+        variables = {**state.variables, **changed, "params": params}
+        return State(variables=variables, optimiser=moments, step=state.step + 1), loss
+
+    bar = tqdm(
+        range(len(history), settings.epochs),
+        initial=len(history),
+        total=settings.epochs,
+        desc=f"{config.task} {config.kind}",
+        unit="epoch",
+        disable=not progress,
+    )
+    for epoch in bar:
+        if _waited(history) >= settings.patience:
+            break
+        started = time.perf_counter()
+        order = np.random.default_rng([settings.seed, epoch]).permutation(training)
+        order = order[: len(order) // settings.batch * settings.batch]
+        losses = []
+        for chosen in order.reshape(-1, settings.batch):
+            state, loss = update(state, examples, jnp.asarray(chosen))
+            losses.append(loss)
+        figures = validate(config, module, robot, state.variables, examples, validation)
+        history.append(
+            {
+                "epoch": epoch,
+                "train_loss": float(np.mean(jax.device_get(losses))),
+                **figures,
+                "seconds": round(time.perf_counter() - started, 2),
+            }
+        )
+        if _waited(history) == 0:
+            best = jax.device_get(state.variables)
+            export()
+        keeper.save(state, best, history)
+        _write_log(history, out)
+        bar.set_postfix_str(f"loss {figures['loss']:.4f}, quality {figures['quality']:.3f}")
+    keeper.close()
+    plot_curves(history, out / "curves.png", f"{config.task} {config.kind}")
+    return export()
+
+
+def init(config: ModelConfig, module: nn.Module, batch: Batch, key: jax.Array) -> dict[str, Any]:
+    """Random variables of a module."""
+    last = batch.clearance if config.kind == "discriminator" else key
+    return module.init(key, batch.image, batch.start, batch.goal, batch.waypoints, last)
+
+
+def loss_fn(
+    config: ModelConfig,
+    module: nn.Module,
+    variables: dict[str, Any],
+    batch: Batch,
+    key: jax.Array,
+    train: bool = False,
+):
+    """The loss () of a batch; with it logits or reconstructions, and changed batch statistics."""
+    last = batch.clearance if config.kind == "discriminator" else key
+    inputs = (batch.image, batch.start, batch.goal, batch.waypoints, last)
+    outputs, changed = module.apply(variables, *inputs, train=train, mutable=["batch_stats"])
+    if config.kind == "discriminator":
+        return models.discriminator_loss(outputs, batch.target, batch.weight), (outputs, changed)
+    loss, error, _ = models.cvae_loss(config, batch.waypoints, *outputs, mask=batch.weight)
+    return loss, (error, changed)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _evaluate(config, module, robot, variables, examples, chosen, key):
+    batch = make_batch(config, robot, examples, chosen)
+    loss, (outputs, _) = loss_fn(config, module, variables, batch, key)
+    return loss, outputs, batch.target, batch.weight
+
+
+def validate(
+    config: ModelConfig,
+    module: nn.Module,
+    robot: MobileRobot,
+    variables: dict[str, Any],
+    examples: Examples,
+    chosen: np.ndarray,
+    size: int = 64,
+) -> dict[str, float]:
+    """Loss on chosen queries (n,), and quality.
+
+    Quality is the area under the ROC curve of a discriminator, and minus the reconstruction error
+    of a CVAE.
+    """
+    parts = np.resize(chosen, (-(-len(chosen) // size), size))
+    key = jax.random.key(0)
+    found = [
+        jax.device_get(_evaluate(config, module, robot, variables, examples, part, key))
+        for part in parts
+    ]
+    loss = float(np.mean([part[0] for part in found]))
+    if config.kind == "cvae":
+        return {"loss": loss, "quality": -float(np.mean([part[1] for part in found]))}
+    logits, target, weight = (np.concatenate([part[i].ravel() for part in found]) for i in (1, 2, 3))
+    return {"loss": loss, "quality": ranking_quality(logits[weight > 0], target[weight > 0])}
+
+
+def ranking_quality(score: np.ndarray, target: np.ndarray) -> float:
+    """Area under the ROC curve: how often a good waypoint scores above a bad one."""
+    good = target > 0.5
+    ranks = scipy.stats.rankdata(score)
+    pairs = max(1, good.sum() * (~good).sum())
+    return float((ranks[good].sum() - good.sum() * (good.sum() + 1) / 2) / pairs)
+
+
+def split_by_home(home: np.ndarray, settings: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of training and of validation queries (Q,): no home is in both.
+
+    Raises:
+        ValueError: all queries are of one home.
+    """
+    homes = np.random.default_rng(settings.seed).permutation(np.unique(home))
+    if len(homes) < 2:
+        raise ValueError("the data are of one home; expected two or more, to hold one out")
+    held_out = homes[: max(1, round(settings.validation * len(homes)))]
+    is_held_out = np.isin(home, held_out)
+    return np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out)
+
+
+class Keeper:
+    """The last epoch on disk, by orbax: a folder appears whole or not at all."""
+
+    def __init__(self, folder: Path):
+        """Look into a folder, or make it."""
+        options = ocp.CheckpointManagerOptions(max_to_keep=1)
+        self._manager = ocp.CheckpointManager(folder.resolve(), options=options)
+
+    def restore(self, state: State) -> tuple[State, Any, list[dict[str, float]]]:
+        """The state, best variables and history of the last epoch; as given if there is none."""
+        best = jax.device_get(state.variables)
+        epoch = self._manager.latest_step()
+        if epoch is None:
+            return state, best, []
+        leaves = ocp.args.StandardRestore({"state": _plain(state), "best": best})
+        arguments = ocp.args.Composite(arrays=leaves, history=ocp.args.JsonRestore())
+        saved = self._manager.restore(epoch, args=arguments)
+        leaves = jax.tree.leaves(saved.arrays["state"])
+        state = jax.tree.unflatten(jax.tree.structure(state), leaves)
+        return state, saved.arrays["best"], saved.history
+
+    def save(self, state: State, best: Any, history: list[dict[str, float]]) -> None:
+        """Write an epoch, then drop the one before."""
+        arrays = ocp.args.StandardSave({"state": _plain(state), "best": best})
+        arguments = ocp.args.Composite(arrays=arrays, history=ocp.args.JsonSave(history))
+        self._manager.save(len(history), args=arguments)
+        self._manager.wait_until_finished()
+
+    def close(self) -> None:
+        """Let go of the folder."""
+        self._manager.close()
+
+
+def _plain(state: State) -> list[jax.Array]:
+    return jax.tree.leaves(state)
+
+
+def _loss(row: dict[str, float]) -> float:
+    return row["loss"]
+
+
+def _waited(history: list[dict[str, float]]) -> int:
+    """Epochs since the best one."""
+    if not history:
+        return 0
+    return len(history) - 1 - int(np.argmin([row["loss"] for row in history]))
+
+
+def _claim(out: Path, config: ModelConfig, settings: TrainConfig, stamp: str) -> Path:
+    """Make the folder ours, or see that it was already."""
+    out.mkdir(parents=True, exist_ok=True)
+    parts = {"model": dataclasses.asdict(config), "settings": dataclasses.asdict(settings)}
+    text = json.dumps({**parts, "data": stamp}, indent=1)
+    file = out / "training.json"
+    if file.exists() and file.read_text() != text:
+        raise ValueError(
+            f"'{out}' holds a training of another model, data set or settings; choose another "
+            "folder with --out, or delete it"
+        )
+    part = file.with_suffix(".part")
+    part.write_text(text)
+    part.replace(file)
+    return out
+
+
+def _write_log(history: list[dict[str, float]], out: Path) -> None:
+    part = out / "log.part"
+    with open(part, "w", newline="") as handle:
+        writer = csv.DictWriter(handle, COLUMNS)
+        writer.writeheader()
+        writer.writerows(history)
+    part.replace(out / "log.csv")
+
+
+def plot_curves(history: list[dict[str, float]], path: Path, title: str) -> None:
+    """Draw training and validation loss, and quality, over the epochs."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    epochs = [row["epoch"] for row in history]
+    left.plot(epochs, [row["train_loss"] for row in history], label="training homes")
+    left.plot(epochs, [row["loss"] for row in history], label="held-out homes")
+    left.set(xlabel="epoch", ylabel="loss", title=title)
+    left.legend()
+    right.plot(epochs, [row["quality"] for row in history])
+    right.set(xlabel="epoch", ylabel="quality on held-out homes")
+    figure.savefig(path, dpi=120)
