@@ -13,8 +13,18 @@ from vrrt_jax.core.kinematics import Chain, chain_from_model, link_poses
 from vrrt_jax.core.types import Spheres, pytree, static
 
 OBSTACLES = 4  # bit of conaffinity: the geom is checked against obstacles
+FOOTPRINT = "footprint"  # geom of a round base that never tilts: a cylinder, not spheres
 _FILES = {"snake": "snake", "fetch": "fetch_mobile"}  # folders in scenes/robots
-_GRAIN = {"snake": 0.0125, "fetch": 0.05}  # half the side of the cubes that spheres cover [m]
+_GRAIN = {"snake": 0.0125, "fetch": 0.05}  # half the side of the bricks that spheres cover [m]
+
+
+@pytree
+class Footprint:
+    """A round base that never tilts."""
+
+    radius: jax.Array  # () [m]
+    height: jax.Array  # () of its top [m]
+    link: int = static()
 
 
 @pytree
@@ -28,9 +38,10 @@ class MobileRobot:
     lower: jax.Array  # (A,) [rad] or [m]
     upper: jax.Array  # (A,) [rad] or [m]
     wraps: jax.Array  # (D,) bool, joints that turn for ever
-    cover: Spheres  # cover the robot: checked against obstacles
+    cover: Spheres  # cover the robot but for its footprint: checked against obstacles
     thin: Spheres  # checked against each other
     pairs: jax.Array  # (P, 2) i32 indices into ``thin``: which of them
+    footprint: Footprint | None
     feature_link: jax.Array  # (F,) i32
     feature_point: jax.Array  # (F, 3) in the link's frame [m]
     name: str = static()
@@ -77,28 +88,29 @@ def load_robot(name: str) -> MobileRobot:
     model = mujoco.MjModel.from_xml_string(xml)
     chain, body_link, body_in_link = chain_from_model(model)
     planar = name == "snake"
-    cover, cover_geoms = _spheres(
-        model, body_link, body_in_link, planar, _GRAIN[name], model.geom_conaffinity & OBSTACLES > 0
-    )
-    thin, thin_geoms = _spheres(
-        model, body_link, body_in_link, planar, _GRAIN[name], model.geom_contype > 0
-    )
     base_dim = 2 if planar else 3
+
+    def spheres(wanted: np.ndarray) -> tuple[Spheres, np.ndarray]:
+        return _cover(model, wanted, body_link, body_in_link, planar=planar, grain=_GRAIN[name])
+
+    is_footprint = np.array([model.geom(g).name == FOOTPRINT for g in range(model.ngeom)])
+    cover, _ = spheres((model.geom_conaffinity & OBSTACLES > 0) & ~is_footprint)
+    thin, owner = spheres((model.geom_contype > 0) & ~is_footprint)
     limited = model.jnt_limited.astype(bool)
-    lower = np.where(limited, model.jnt_range[:, 0], -np.pi)
-    upper = np.where(limited, model.jnt_range[:, 1], np.pi)
-    site_link = body_link[model.site_bodyid]
+    lower = np.where(limited, model.jnt_range[:, 0], -np.pi)[base_dim:]
+    upper = np.where(limited, model.jnt_range[:, 1], np.pi)[base_dim:]
     site_pose = body_in_link[model.site_bodyid]
     points = np.einsum("nij,nj->ni", site_pose[:, :3, :3], model.site_pos) + site_pose[:, :3, 3]
     return MobileRobot(
         chain=chain,
-        lower=jnp.asarray(lower[base_dim:], jnp.float32),
-        upper=jnp.asarray(upper[base_dim:], jnp.float32),
+        lower=jnp.asarray(lower, jnp.float32),
+        upper=jnp.asarray(upper, jnp.float32),
         wraps=jnp.asarray(~limited & (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)),
         cover=cover,
         thin=thin,
-        pairs=jnp.asarray(_checked(model, thin_geoms), jnp.int32),
-        feature_link=jnp.asarray(site_link, jnp.int32),
+        pairs=jnp.asarray(_checked_pairs(model, owner), jnp.int32),
+        footprint=_footprint(model, body_link) if is_footprint.any() else None,
+        feature_link=jnp.asarray(body_link[model.site_bodyid], jnp.int32),
         feature_point=jnp.asarray(points, jnp.float32),
         name=name,
         joint_names=tuple(model.joint(j).name for j in range(model.njnt)),
@@ -114,18 +126,33 @@ def _scenes_dir() -> Path:
     return installed if installed.is_dir() else package.parent / "scenes"
 
 
-def _spheres(
+def _footprint(model: mujoco.MjModel, body_link: np.ndarray) -> Footprint:
+    geom = model.geom(FOOTPRINT)
+    radius, half = geom.size[:2]
+    return Footprint(
+        radius=jnp.float32(radius),
+        height=jnp.float32(geom.pos[2] + half),
+        link=int(body_link[geom.bodyid[0]]),
+    )
+
+
+def _cover(
     model: mujoco.MjModel,
+    wanted: np.ndarray,
     body_link: np.ndarray,
     body_in_link: np.ndarray,
+    *,
     planar: bool,
     grain: float,
-    wanted: np.ndarray,
 ) -> tuple[Spheres, np.ndarray]:
     """Spheres that cover the wanted geoms, in the links' frames, and the geom of each."""
     link, centre, radius, owner = [], [], [], []
     for geom in np.flatnonzero(wanted):
-        centres, radii = _cover_geom(model, geom, planar, grain)
+        centres, radii = cover_geom(
+            mujoco.mjtGeom(model.geom_type[geom]),
+            model.geom_size[geom] * ([1, 1, 0] if planar else [1, 1, 1]),
+            grain,
+        )
         body = model.geom_bodyid[geom]
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
@@ -143,49 +170,48 @@ def _spheres(
     return spheres, np.array(owner)
 
 
-def _cover_geom(
-    model: mujoco.MjModel, geom: int, planar: bool, grain: float
+def cover_geom(
+    kind: mujoco.mjtGeom, size: np.ndarray, grain: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (n, 3) and radii (n,) of spheres that cover a box or a sphere, in its frame."""
-    size = model.geom_size[geom]
-    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE:
-        return np.zeros((1, 3)), size[:1]
-    half = size * [1, 1, 0] if planar else size
-    return cover_box(half, grain)
-
-
-def cover_box(half: np.ndarray, grain: float) -> tuple[np.ndarray, np.ndarray]:
-    """Cut a box into bricks of half sides up to ``grain``, and put a sphere around each.
+    """Spheres that cover a geom: a box brick by brick, a capsule along its axis.
 
     Args:
-        half: (3,) half sides [m].
-        grain: [m].
+        kind: sphere, capsule or box.
+        size: (3,) as MuJoCo's [m].
+        grain: half the longest side of a brick, half the longest way between two spheres [m].
 
     Returns:
-        Centres (n, 3) in the box's frame and radii (n,).
+        Centres (n, 3) in the geom's frame and radii (n,).
+
+    Raises:
+        ValueError: another kind.
     """
-    counts = np.maximum(np.ceil(half / grain - 1e-6), 1).astype(int)
-    ticks = [h * (2 * np.arange(n) + 1 - n) / n for h, n in zip(half, counts, strict=True)]
-    centres = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-    return centres, np.full(len(centres), np.linalg.norm(half / counts))
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return np.zeros((1, 3)), size[:1]
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        radius, half = size[:2]
+        count = int(np.ceil(half / grain - 1e-6))
+        centres = np.zeros((count + 1, 3))
+        centres[:, 2] = np.linspace(-half, half, count + 1)
+        return centres, np.full(count + 1, np.hypot(radius, half / count))
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        counts = np.maximum(np.ceil(size / grain - 1e-6), 1).astype(int)
+        ticks = [h * (2 * np.arange(n) + 1 - n) / n for h, n in zip(size, counts, strict=True)]
+        centres = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+        return centres, np.full(len(centres), np.linalg.norm(size / counts))
+    raise ValueError(f"geom of kind {kind.name}: expected spheres, capsules and boxes")
 
 
-def _checked(model: mujoco.MjModel, owner: np.ndarray) -> np.ndarray:
+def _checked_pairs(model: mujoco.MjModel, owner: np.ndarray) -> np.ndarray:
     """Pairs (P, 2) of spheres whose geoms may collide by MuJoCo's own rules."""
-    excluded = {(int(s) >> 16, int(s) & 0xFFFF) for s in model.exclude_signature}
     first, second = np.triu_indices(len(owner), 1)
     a, b = owner[first], owner[second]
-    masks = (model.geom_contype[a] & model.geom_conaffinity[b]) | (
+    wanted = (model.geom_contype[a] & model.geom_conaffinity[b]) | (
         model.geom_contype[b] & model.geom_conaffinity[a]
     )
     body_a, body_b = model.geom_bodyid[a], model.geom_bodyid[b]
-    weld_a, weld_b = model.body_weldid[body_a], model.body_weldid[body_b]
-    parent_a = model.body_weldid[model.body_parentid[weld_a]]
-    parent_b = model.body_weldid[model.body_parentid[weld_b]]
-    adjacent = (weld_a == weld_b) | (parent_a == weld_b) | (parent_b == weld_a)
-    apart = [
-        (int(i), int(j)) in excluded or (int(j), int(i)) in excluded
-        for i, j in zip(body_a, body_b, strict=True)
-    ]
-    keep = (masks > 0) & ~adjacent & ~np.array(apart, bool)
+    parent = model.body_parentid
+    related = (body_a == body_b) | (parent[body_a] == body_b) | (parent[body_b] == body_a)
+    signature = (np.minimum(body_a, body_b) << 16) + np.maximum(body_a, body_b)
+    keep = (wanted > 0) & ~related & ~np.isin(signature, model.exclude_signature)
     return np.stack([first[keep], second[keep]], axis=1)

@@ -1,25 +1,33 @@
-"""A robot in a home: covering spheres against the distance field of an occupancy grid.
-
-The field holds exact distances to the solid cells at the points of a lattice. Between them the
-distance changes no faster than one moves, so ``field - offset`` never promises more room than there
-is: no collision of a covering sphere is missed.
-"""
+"""A robot in a home: is this configuration free, how far is it to that one, and on which way."""
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import ndimage
 
+from nrp_jax import reeds_shepp
+from nrp_jax.field import Field, make_field, room
 from nrp_jax.grid import Grid
 from nrp_jax.robots import MobileRobot
 from vrrt_jax.core.edges import Straight, joint_steps
 from vrrt_jax.core.kinematics import Chain, link_poses, place, placement
-from vrrt_jax.core.types import Spheres, pytree
+from vrrt_jax.core.types import Spheres, pytree, static
 
 ARM_WEIGHT = {"snake": 0.167, "fetch": 0.125}  # of the paper's metrics
 RESOLUTION = {"snake": 0.1, "fetch": 0.2}  # sub-steps of the paper [m] and [rad]
+TURNING_RADIUS = 0.1  # of the Fetch's base [m]
+SHORTLIST = 16  # nodes for which the length of a curve is computed
+
+
+@pytree
+class RoundBase:
+    """A round base among the cells that are low enough to be in its way."""
+
+    field: Field  # planar
+    radius: jax.Array  # () [m]
+    height: jax.Array  # () [m]
+    link: int = static()
 
 
 @pytree
@@ -33,11 +41,11 @@ class GridWorld(Straight):
     chain: Chain
     cover: jax.Array  # (L * 12, 3 n) placement of the covering spheres
     cover_radius: jax.Array  # (n,) [m]
+    floor: jax.Array  # (n,) lowest height of their centres, -inf if they may touch the floor [m]
     thin: jax.Array  # (L * 12, 3 m) placement of the spheres checked against each other
     reach: jax.Array  # (m, m) distance at which two of them touch, 0 for pairs not checked [m]
-    field: jax.Array  # (X', Y', Z') distance to the nearest solid cell at lattice points [m]
-    field_origin: jax.Array  # (3,) position of the first lattice point [m]
-    field_step: jax.Array  # () between lattice points [m]
+    base: RoundBase | None
+    field: Field
     lower: jax.Array  # (D,)
     upper: jax.Array  # (D,)
     wraps: jax.Array  # (D,) bool
@@ -50,7 +58,7 @@ class GridWorld(Straight):
 
     def interpolate(self, q_a: jax.Array, q_b: jax.Array, fraction: jax.Array) -> jax.Array:
         """Configurations (..., D) at a fraction (...) of the edges between others (..., D)."""
-        part = self.part(self.edge(q_a, q_b), jnp.asarray(fraction))
+        part = self.part(self.edge(q_a, q_b), jnp.asarray(fraction, q_a.dtype))
         return self.normalise(self.end(q_a, part))
 
     def distances(self, nodes: jax.Array, q: jax.Array, among: jax.Array) -> jax.Array:
@@ -59,54 +67,138 @@ class GridWorld(Straight):
         for joint in range(q.shape[1]):
             squared = joint_steps(self, nodes, q, joint) ** 2
             base, arm = (base + squared, arm) if joint < 2 else (base, arm + squared)
-        length = jnp.sqrt(base) + self.arm_weight * jnp.sqrt(arm)
-        return jnp.where(among, length, jnp.inf)
+        return jnp.where(among, jnp.sqrt(base) + self.arm_weight * jnp.sqrt(arm), jnp.inf)
 
     def length(self, edge: jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`."""
-        base, arm = (jnp.sqrt(jnp.sum(s**2, -1)) for s in (edge[..., :2], edge[..., 2:]))
-        return base + self.arm_weight * arm
+        return _norm(edge[..., :2]) + self.arm_weight * _norm(edge[..., 2:])
+
+    def span(self, edge: jax.Array) -> jax.Array:
+        """The longest way (...) of any joint along an edge [m] or [rad]."""
+        return jnp.max(jnp.abs(edge), axis=-1)
 
     def steer(self, q_from: jax.Array, target: jax.Array, num_steps: int) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`."""
-        edge = self.edge(q_from, jnp.clip(target, self.lower, self.upper))
-        longest = jnp.max(jnp.abs(edge), axis=-1)
-        return self.part(
-            edge, jnp.minimum(1.0, num_steps * self.resolution / jnp.maximum(longest, 1e-9))
-        )
+        inside = jnp.where(self.wraps, target, jnp.clip(target, self.lower, self.upper))
+        edge = self.edge(q_from, inside)
+        longest = num_steps * self.resolution
+        return self.part(edge, jnp.minimum(1.0, longest / jnp.maximum(self.span(edge), 1e-9)))
 
     def checkable(self, edge: jax.Array, num_steps: int) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`."""
-        return jnp.max(jnp.abs(edge), axis=-1) <= num_steps * self.resolution * (1 + 1e-5)
+        return self.span(edge) <= num_steps * self.resolution * (1 + 1e-5)
+
+
+@pytree
+class CarEdge:
+    """A drive of the base, while the arm goes straight."""
+
+    curve: reeds_shepp.Curve
+    arm: jax.Array  # (..., D - 3) step
+    target: jax.Array  # (..., D) where the whole edge leads
+    done: jax.Array  # (...) 1 while nothing has been cut off
+
+
+@pytree
+class CarWorld(GridWorld):
+    """The same with a base that turns and drives like a car, forwards and in reverse."""
+
+    radius: jax.Array  # () smallest turning radius [m]
+
+    def distance(self, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
+        """See :class:`vrrt_jax.core.edges.Space`."""
+        drive = reeds_shepp.length(q_a[..., :3], q_b[..., :3], self.radius)
+        arm = Straight.edge(self, q_a, q_b)[..., 3:]
+        return drive + self.arm_weight * _norm(arm)
+
+    def distances(self, nodes: jax.Array, q: jax.Array, among: jax.Array) -> jax.Array:
+        """See :class:`vrrt_jax.core.edges.Space`; +inf beyond a shortlist of nearest nodes.
+
+        No drive is shorter than the straight line, nor than its turn at the smallest radius.
+        """
+        line, arm = jnp.zeros((2, q.shape[0], nodes.shape[0]), q.dtype)
+        for joint in range(q.shape[1]):
+            step = joint_steps(self, nodes, q, joint)
+            if joint == 2:
+                turn = self.radius * jnp.abs(step)
+                continue
+            line, arm = (line + step**2, arm) if joint < 2 else (line, arm + step**2)
+        bound = jnp.maximum(jnp.sqrt(line), turn) + self.arm_weight * jnp.sqrt(arm)
+        bound = jnp.where(among, bound, jnp.inf)
+        nearest, index = _shortlist(bound)
+        exact = self.distance(q[:, None], nodes[index])
+        exact = jnp.where(jnp.isfinite(nearest), exact, jnp.inf)
+        row = jnp.arange(q.shape[0])[:, None]
+        return jnp.full(bound.shape, jnp.inf, q.dtype).at[row, index].set(exact)
+
+    def edge(self, q_from: jax.Array, q_to: jax.Array) -> CarEdge:
+        """See :class:`vrrt_jax.core.edges.Space`."""
+        step = Straight.edge(self, q_from, q_to)
+        return CarEdge(
+            curve=reeds_shepp.shortest(q_from[..., :3], q_to[..., :3], self.radius),
+            arm=step[..., 3:],
+            target=jnp.broadcast_to(q_to, step.shape),
+            done=jnp.ones(step.shape[:-1], step.dtype),
+        )
+
+    def part(self, edge: CarEdge, fraction: jax.Array) -> CarEdge:
+        """See :class:`vrrt_jax.core.edges.Space`."""
+        return CarEdge(
+            curve=reeds_shepp.cut(edge.curve, fraction),
+            arm=edge.arm * fraction[..., None],
+            target=edge.target,
+            done=edge.done * fraction,
+        )
+
+    def length(self, edge: CarEdge) -> jax.Array:
+        """See :class:`vrrt_jax.core.edges.Space`."""
+        return self._drive(edge) + self.arm_weight * _norm(edge.arm)
+
+    def span(self, edge: CarEdge) -> jax.Array:
+        """The longer (...) of the base's way [m] and the longest of any joint of the arm."""
+        return jnp.maximum(self._drive(edge), jnp.max(jnp.abs(edge.arm), axis=-1))
+
+    def end(self, q_from: jax.Array, edge: CarEdge) -> jax.Array:
+        """See :class:`vrrt_jax.core.edges.Space`; the whole edge ends at its target exactly."""
+        base = reeds_shepp.follow(q_from[..., :3], edge.curve, self.radius)
+        q = jnp.concatenate([base, q_from[..., 3:] + edge.arm], axis=-1)
+        return jnp.where((edge.done >= 1)[..., None], edge.target, q)
+
+    def _drive(self, edge: CarEdge) -> jax.Array:
+        return reeds_shepp.curve_length(edge.curve) * self.radius
 
 
 def is_free(world: GridWorld, q: jax.Array) -> jax.Array:
-    """Whether ``q`` (D,) touches neither a solid cell nor itself, () bool.
+    """Whether ``q`` (D,) touches no solid cell, not the floor, nor itself, () bool.
 
-    Joint limits are not looked at; outside the map all is solid. Pure and vmappable.
+    Joint limits are not looked at; beside the map all is solid. Pure and vmappable.
     """
     poses = link_poses(world.chain, q)
-    centres = place(world.thin, poses)
-    apart = sum((axis[:, None] - axis[None]) ** 2 for axis in centres)
-    clear = jnp.all(apart >= world.reach**2)
-    return clear & jnp.all(clearance_at(world, place(world.cover, poses)) > world.cover_radius)
+    thin = place(world.thin, poses)
+    apart = sum((axis[:, None] - axis[None]) ** 2 for axis in thin)
+    centres = place(world.cover, poses)
+    free = jnp.all(apart >= world.reach**2)
+    free &= jnp.all(room(world.field, centres) > world.cover_radius)
+    free &= jnp.all(centres[2] > world.floor)
+    if world.base is not None:
+        free &= _base_is_free(world.base, poses, centres, world.cover_radius, world.floor)
+    return free
 
 
 batch_is_free = jax.jit(jax.vmap(is_free, (None, 0)))  # of q (n, D), for the host
 
 
-def clearance_at(world: GridWorld, points: jax.Array) -> jax.Array:
-    """A lower bound (n,) of the distance from points (3, n) to the nearest solid cell [m]."""
-    shape = world.field.shape
-    place = (points - world.field_origin[:, None]) / world.field_step
-    index, squared = jnp.int32(0), 0.0
-    for axis in range(2 if shape[2] == 1 else 3):
-        near = jnp.clip(jnp.round(place[axis]), 0, shape[axis] - 1)
-        # Beyond the top and the bottom nothing is solid, and points there are farther still.
-        along = place[axis] if axis < 2 else jnp.clip(place[axis], 0, shape[axis] - 1)
-        squared += (along - near) ** 2
-        index = index * shape[axis] + near.astype(jnp.int32)
-    return world.field.reshape(-1)[index] - world.field_step * jnp.sqrt(squared)
+def _base_is_free(
+    base: RoundBase, poses: jax.Array, centres: jax.Array, radius: jax.Array, floor: jax.Array
+) -> jax.Array:
+    """Whether a cylinder touches neither a cell nor the spheres that must not touch the floor."""
+    position = poses[base.link, :3, 3:]
+    beside = jnp.sqrt(jnp.sum((centres[:2] - position[:2]) ** 2, axis=0)) - base.radius
+    above = centres[2] - base.height
+    gap = jnp.maximum(beside, 0.0) ** 2 + jnp.maximum(above, 0.0) ** 2
+    return (room(base.field, position)[0] > base.radius) & jnp.all(
+        (gap > radius**2) | jnp.isinf(floor)
+    )
 
 
 def build_world(
@@ -117,7 +209,8 @@ def build_world(
     Args:
         robot: from :func:`nrp_jax.load_robot`.
         grid: from :func:`nrp_jax.load_map` or a generator; the snake sees its planar map.
-        wrap: joints without limits turn the short way round; otherwise they are intervals.
+        wrap: joints without limits turn the short way round; otherwise they are intervals, as in
+            the paper. A heading always wraps.
         resolution: longest sub-step of any joint between two collision checks [m] or [rad].
 
     Raises:
@@ -126,24 +219,30 @@ def build_world(
     resolution = RESOLUTION[robot.name] if resolution is None else resolution
     if not resolution > 0:
         raise ValueError(f"resolution is {resolution}; expected a positive number, such as 0.1")
-    reach = np.zeros((len(robot.thin.radius),) * 2, np.float32)
-    radius, (first, second) = np.asarray(robot.thin.radius), np.asarray(robot.pairs).T
-    reach[first, second] = radius[first] + radius[second]
     grid = _fitting(robot.planar, grid)
-    low, high = _limits(robot, grid)
-    return GridWorld(
-        chain=robot.chain,
-        cover=_placement(robot.cover, robot.chain),
-        cover_radius=robot.cover.radius,
-        thin=_placement(robot.thin, robot.chain),
-        reach=jnp.asarray(reach),
-        **_field(grid),
-        lower=low,
-        upper=high,
-        wraps=robot.wraps & wrap,
-        arm_weight=jnp.float32(ARM_WEIGHT[robot.name]),
-        resolution=jnp.float32(resolution),
-    )
+    is_arm = np.asarray(robot.cover.link) > robot.base_dim + 1
+    floor = np.where(is_arm & (not robot.planar), robot.cover.radius, -np.inf)
+    turn = [np.pi] * (robot.base_dim - 2)
+    is_base = np.arange(robot.num_joints) < robot.base_dim
+    corner = np.array(grid.origin[:2])
+    fields = {
+        "chain": robot.chain,
+        "cover": _placement(robot.cover, robot.chain),
+        "cover_radius": robot.cover.radius,
+        "floor": jnp.asarray(floor, jnp.float32),
+        "thin": _placement(robot.thin, robot.chain),
+        "reach": jnp.asarray(_reach(robot)),
+        "base": _round_base(robot, grid),
+        "field": make_field(grid),
+        "lower": _float(np.concatenate([corner, np.negative(turn), robot.lower])),
+        "upper": _float(np.concatenate([corner + grid.size[:2], turn, robot.upper])),
+        "wraps": robot.wraps & (is_base | wrap),
+        "arm_weight": jnp.float32(ARM_WEIGHT[robot.name]),
+        "resolution": jnp.float32(resolution),
+    }
+    if robot.base_dim == 2:
+        return GridWorld(**fields)
+    return CarWorld(**fields, radius=jnp.float32(TURNING_RADIUS))
 
 
 def with_grid(world: GridWorld, grid: Grid) -> GridWorld:
@@ -152,13 +251,17 @@ def with_grid(world: GridWorld, grid: Grid) -> GridWorld:
     Raises:
         ValueError: a planar map for a robot that is not.
     """
-    grid = _fitting(world.field.shape[2] == 1, grid)
-    low = np.array(grid.origin[:2])
+    grid = _fitting(world.field.values.shape[2] == 1, grid)
+    corner = np.array(grid.origin[:2])
+    base = world.base
+    if base is not None:
+        base = dataclasses.replace(base, field=_low_field(grid, float(base.height)))
     return dataclasses.replace(
         world,
-        **_field(grid),
-        lower=world.lower.at[:2].set(low),
-        upper=world.upper.at[:2].set(low + grid.size[:2]),
+        base=base,
+        field=make_field(grid),
+        lower=world.lower.at[:2].set(corner),
+        upper=world.upper.at[:2].set(corner + grid.size[:2]),
     )
 
 
@@ -166,6 +269,16 @@ def sample_configurations(world: GridWorld, key: jax.Array, n: int) -> jax.Array
     """Uniform configurations (n, D) inside the limits."""
     shape = (n, world.lower.shape[0])
     return jax.random.uniform(key, shape, minval=world.lower, maxval=world.upper)
+
+
+def _norm(step: jax.Array) -> jax.Array:
+    return jnp.sqrt(jnp.sum(step**2, axis=-1))
+
+
+def _shortlist(bound: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Smallest bounds (B, k) of (B, N) and where they are; the nearest is among them."""
+    smallest, index = jax.lax.top_k(-bound, min(SHORTLIST, bound.shape[1]))
+    return -smallest, index
 
 
 def _fitting(planar: bool, grid: Grid) -> Grid:
@@ -179,43 +292,33 @@ def _fitting(planar: bool, grid: Grid) -> Grid:
     return grid
 
 
-def _limits(robot: MobileRobot, grid: Grid) -> tuple[jax.Array, jax.Array]:
-    turn = [np.pi] * (robot.base_dim - 2)
-    low = np.array(grid.origin[:2])
-    lower = np.concatenate([low, np.negative(turn), np.asarray(robot.lower)])
-    upper = np.concatenate([low + grid.size[:2], turn, np.asarray(robot.upper)])
-    return jnp.asarray(lower, jnp.float32), jnp.asarray(upper, jnp.float32)
+def _reach(robot: MobileRobot) -> np.ndarray:
+    radius, (first, second) = np.asarray(robot.thin.radius), np.asarray(robot.pairs).T
+    reach = np.zeros((len(radius),) * 2, np.float32)
+    reach[first, second] = radius[first] + radius[second]
+    return reach
 
 
-def _field(grid: Grid) -> dict[str, jax.Array]:
-    """Distances at a lattice ``fine`` times as dense as the cells, whose corners belong to it.
-
-    The nearest point of a cell to a lattice point is a lattice point too, so the distance transform
-    of the lattice is exact.
-    """
-    fine = 4 if grid.planar else 2
-    solid = np.pad(grid.occupied, [(1, 1), (1, 1), (0, 0)], constant_values=True)
-    for axis in range(2 if grid.planar else 3):
-        solid = _refine(solid, fine, axis)
-    step = grid.resolution / fine
-    distance = ndimage.distance_transform_edt(~solid, sampling=step)
-    origin = np.array(grid.origin) - grid.resolution * np.array([1, 1, 0])
-    return {
-        "field": jnp.asarray(distance, jnp.float32),
-        "field_origin": jnp.asarray(origin, jnp.float32),
-        "field_step": jnp.float32(step),
-    }
+def _round_base(robot: MobileRobot, grid: Grid) -> RoundBase | None:
+    footprint = robot.footprint
+    if footprint is None:
+        return None
+    return RoundBase(
+        field=_low_field(grid, float(footprint.height)),
+        radius=footprint.radius,
+        height=footprint.height,
+        link=footprint.link,
+    )
 
 
-def _refine(solid: np.ndarray, fine: int, axis: int) -> np.ndarray:
-    """From n cells along an axis to n * fine + 1 lattice points; borders are solid if a side is."""
-    solid = np.moveaxis(solid, axis, 0)
-    points = np.zeros((solid.shape[0] * fine + 1, *solid.shape[1:]), bool)
-    for k in range(fine + 1):
-        points[k : k + len(solid) * fine : fine] |= solid
-    return np.moveaxis(points, 0, axis)
+def _low_field(grid: Grid, height: float) -> Field:
+    return make_field(grid.flatten(-np.inf, height))
 
 
 def _placement(spheres: Spheres, chain: Chain) -> jax.Array:
     matrix = placement(np.asarray(spheres.link), np.asarray(spheres.centre), chain.num_links)
-    return jnp.asarray(matrix)
+    return _float(matrix)
+
+
+def _float(array: np.ndarray) -> jax.Array:
+    return jnp.asarray(array, jnp.float32)
