@@ -18,6 +18,7 @@ from nrp_jax.robots import MobileRobot, link_features
 from nrp_jax.world import GridWorld, build_world
 from vrrt_jax.core.types import pytree
 
+RESOLUTION = 0.1  # side of a cell, in all that the models have seen [m]
 MAP_CELLS = {"snake": 100, "fetch": 150}  # side of the whole map, for models that see all of it
 
 
@@ -52,8 +53,8 @@ def surrounding_map(config: ModelConfig, world: GridWorld) -> jax.Array:
 
     Distances to obstacles [m]; for the published models occupancies.
     """
-    distances = features.surroundings(world.field, config.task == "snake")
-    half = context.WINDOW_CELLS // 2
+    distances = features.surroundings(world.field)
+    half = context.SIDE // 2
     border = ((half, half), (half, half), (0, 0))
     distances = jnp.pad(distances, border)
     return jnp.where(distances > 0, 0.0, 1.0) if config.paper else distances
@@ -75,9 +76,9 @@ def view(
         The image (X', Y', Z); the origin (2,) of the local frame [m].
     """
     if config.scope == "window":
-        image = context.window(padded, resolution, q, origin)
-        return image, context.window_centre(q, resolution, origin)
-    side, half = MAP_CELLS[config.task], context.WINDOW_CELLS // 2
+        image = context.window(padded, q, resolution, origin)
+        return image, context.centre(q, resolution, origin)
+    side, half = MAP_CELLS[config.task], context.SIDE // 2
     size = np.array(padded.shape[:2]) - 2 * half
     excess = np.maximum(side - size, 0)  # maps may be smaller, or larger and then are cut
     solid = 1.0 if config.paper else 0.0
@@ -179,9 +180,7 @@ def make_batch(
     )
 
 
-def describe(
-    config: ModelConfig, robot: MobileRobot, q: jax.Array, points: jax.Array
-) -> jax.Array:
+def describe(config: ModelConfig, robot: MobileRobot, q: jax.Array, points: jax.Array) -> jax.Array:
     """Features (n, C, E) of local configurations (n, C, D) with link frames (n, C, F, 3)."""
     one = functools.partial(features.configuration_features, config, robot)
     return jax.vmap(jax.vmap(one))(q, points)
@@ -191,14 +190,10 @@ def _local(config: ModelConfig, examples: Examples, index: jax.Array):
     """Image, start, goal and waypoints of one query, in its local frame."""
     home, q = examples.home[index], examples.start[index]
     if config.scope == "window":
-        # One slice of the stack: ``maps[home]`` would copy a whole map for every row.
-        first = jnp.round(q[:2] / 0.1).astype(jnp.int32)
-        side = context.WINDOW_CELLS
-        size = (1, side, side, examples.maps.shape[3])
-        image = jax.lax.dynamic_slice(examples.maps, (home, first[0], first[1], 0), size)[0]
-        centre = context.window_centre(q)
+        image = context.stacked_window(examples.maps, home, q)
+        centre = context.centre(q)
     else:
-        image, centre = view(config, examples.maps[home], q, jnp.float32(0.1), jnp.zeros(2))
+        image, centre = view(config, examples.maps[home], q, jnp.float32(RESOLUTION), jnp.zeros(2))
     ends = (q, examples.goal[index], examples.waypoints[index])
     return image.astype(jnp.float32), *(features.to_local(end, centre) for end in ends)
 
@@ -206,4 +201,4 @@ def _local(config: ModelConfig, examples: Examples, index: jax.Array):
 def clearances(robot: MobileRobot, image: jax.Array, q: jax.Array, points: jax.Array) -> jax.Array:
     """What an image (X, Y, Z) holds where local waypoints (C, D), with frames, would be: (C, P)."""
     touched = jax.vmap(lambda q, p: features.clearance_points(robot, q, p))(q, points)
-    return image.reshape(-1)[features.cells(touched, image.shape, 0.1)]
+    return image.reshape(-1)[features.cells(touched, image.shape, RESOLUTION)]

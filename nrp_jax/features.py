@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from nrp_jax.field import FINE, Field
 from nrp_jax.models import ModelConfig
 from nrp_jax.robots import MobileRobot
 
 FAR = 6.0  # goals farther than this look as if they were this far [m]
 CLEAR = 1.0  # distances to obstacles beyond this do not matter [m]
-FINE = {True: 4, False: 2}  # lattice points of a world's field along a cell, if planar or not
 HEADING = 2  # the joint that turns the whole robot, for both robots
 
 
@@ -106,14 +106,15 @@ def cells(points: jax.Array, shape: tuple[int, ...], resolution: float) -> jax.A
     return (index[..., 0] * shape[1] + index[..., 1]) * shape[2] + index[..., 2]
 
 
-def surroundings(field: jax.Array, planar: bool) -> jax.Array:
-    """The map (X, Y, Z) behind a world's lattice of distances: at each cell's middle [m].
+def surroundings(field: Field) -> jax.Array:
+    """The map (X, Y, Z) behind a field: distances to obstacles at each cell's middle [m].
 
-    Distances beyond ``CLEAR`` count as that; solid cells hold 0, as does all outside the map.
+    Distances beyond ``CLEAR`` count as that; solid cells hold 0.
     """
-    fine = FINE[planar]
-    first = fine + fine // 2  # the lattice has a border of one cell in x and y
-    inside = field[first:-first:fine, first:-first:fine]
+    planar = field.values.shape[2] == 1
+    fine = FINE[2 if planar else 3]
+    first = fine + fine // 2  # the field has a rim of one cell in x and y
+    inside = field.values[first:-first:fine, first:-first:fine]
     return jnp.minimum(inside if planar else inside[:, :, fine // 2 :: fine], CLEAR)
 
 

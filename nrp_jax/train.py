@@ -215,7 +215,9 @@ def validate(
     loss = float(np.mean([part[0] for part in found]))
     if config.kind == "cvae":
         return {"loss": loss, "quality": -float(np.mean([part[1] for part in found]))}
-    logits, target, weight = (np.concatenate([part[i].ravel() for part in found]) for i in (1, 2, 3))
+    logits, target, weight = (
+        np.concatenate([part[i].ravel() for part in found]) for i in (1, 2, 3)
+    )
     return {"loss": loss, "quality": ranking_quality(logits[weight > 0], target[weight > 0])}
 
 
