@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax import context, features
+from nrp_jax.data import Dataset
 from nrp_jax.grid import Grid
 from nrp_jax.models import ModelConfig
 from nrp_jax.robots import MobileRobot, link_features
@@ -19,6 +20,7 @@ from nrp_jax.world import GridWorld, build_world
 from vrrt_jax.core.types import pytree
 
 RESOLUTION = 0.1  # side of a cell, in all that the models have seen [m]
+DETOUR = 1.1  # a path so much longer than the optimum still is a good one
 MAP_CELLS = {"snake": 100, "fetch": 150}  # side of the whole map, for models that see all of it
 
 
@@ -92,6 +94,40 @@ def view(
     image = image[first[0] : first[0] + side, first[1] : first[1] + side]
     corner = first - excess // 2
     return image, origin[:2] + (jnp.asarray(corner) + side / 2) * resolution
+
+
+def load_examples(
+    config: ModelConfig, robot: MobileRobot, dataset: Dataset, *, soft: bool = True
+) -> Examples:
+    """The rows of a data set that a model learns from.
+
+    A discriminator learns from all, a CVAE from good waypoints alone.
+
+    Args:
+        config: of the model to train.
+        robot: whose configurations they are.
+        dataset: from :func:`nrp_jax.data.load_dataset`.
+        soft: a discriminator's target falls off with the detour; otherwise it is 0 or 1.
+
+    Raises:
+        ValueError: the data set is of another task.
+    """
+    if dataset.settings.task != config.task:
+        raise ValueError(
+            f"the data set is of task '{dataset.settings.task}', the model of '{config.task}'; "
+            "give another data set, or the other --task"
+        )
+    rows = dataset.rows
+    good = rows["ratio"] <= DETOUR
+    if config.kind == "cvae":
+        rows = {name: column[good] for name, column in rows.items()}
+        target = weight = np.ones(good.sum())
+    else:
+        detour = np.maximum(rows["ratio"] - 1.0, 0.0)
+        target = np.exp(-detour / (DETOUR - 1.0)) if soft else good.astype(np.float32)
+        weight = np.ones(len(good))
+    grids = [grid.flatten() if robot.planar else grid for grid in dataset.grids]
+    return make_examples(config, robot, grids, rows, target=target, weight=weight)
 
 
 def make_examples(

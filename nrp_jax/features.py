@@ -44,7 +44,7 @@ def configuration_features(
         config: of the model.
         robot: whose configuration it is.
         q: (D,) in the local frame.
-        points: (F, 3) from :func:`nrp_jax.link_features` [m]; a planar robot's heights are left out.
+        points: (F, 3) from :func:`nrp_jax.link_features` [m]; heights only if it is not planar.
     """
     if config.paper:
         joints = q

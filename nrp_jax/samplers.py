@@ -93,21 +93,19 @@ class Discriminator:
         # All lanes share these, so that their kinematics are computed once.
         low, high = world.lower.at[:2].set(-REACH), world.upper.at[:2].set(REACH)
         q = jax.random.uniform(key_any, (num_any, len(low)), minval=low, maxval=high)
-        parts = [(q, jax.vmap(lambda q: link_features(self.robot, q))(q))]
-        parts = [jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), parts[0])]
+        both = (q, jax.vmap(lambda q: link_features(self.robot, q))(q))
+        parts = [jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), both)]
         if num_along:
             q = _postures(self.robot, world, q_from, q_goal, key_posture)
             frames = jax.vmap(jax.vmap(lambda q: link_features(self.robot, q)))(q)
             place = jax.random.uniform(
                 key_place, (lanes, num_along, POSTURES, 2), minval=-REACH, maxval=REACH
             )
-            q = jnp.broadcast_to(q[:, None], (*place.shape[:3], q.shape[-1])).at[..., :2].set(place)
+            q = jnp.broadcast_to(q[:, None], (*place.shape[:3], q.shape[-1]))
             frames = frames[:, None] + jnp.pad(place, [(0, 0)] * 3 + [(0, 1)])[..., None, :]
-            parts.append(
-                (q.reshape(lanes, -1, q.shape[-1]), frames.reshape(lanes, -1, *frames.shape[3:]))
-            )
-        q, points = (jnp.concatenate(part, axis=1) for part in zip(*parts, strict=True))
-        return q, points
+            both = (q.at[..., :2].set(place), frames)
+            parts.append(jax.tree.map(lambda x: x.reshape(lanes, -1, *x.shape[3:]), both))
+        return jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *parts)
 
 
 @pytree

@@ -1,5 +1,6 @@
 """Training of the discriminator and the CVAE."""
 
+import argparse
 import csv
 import dataclasses
 import functools
@@ -19,9 +20,10 @@ from tqdm import tqdm
 
 from nrp_jax import models
 from nrp_jax.checkpoint import Model, build_module, save_model
-from nrp_jax.examples import Batch, Examples, make_batch
+from nrp_jax.data import load_dataset
+from nrp_jax.examples import Batch, Examples, load_examples, make_batch
 from nrp_jax.models import ModelConfig
-from nrp_jax.robots import MobileRobot
+from nrp_jax.robots import MobileRobot, load_robot
 from vrrt_jax.core.types import pytree
 
 COLUMNS = ("epoch", "train_loss", "loss", "quality", "seconds")
@@ -331,3 +333,63 @@ def plot_curves(history: list[dict[str, float]], path: Path, title: str) -> None
     right.plot(epochs, [row["quality"] for row in history])
     right.set(xlabel="epoch", ylabel="quality on held-out homes")
     figure.savefig(path, dpi=120)
+
+
+def add_arguments(subparsers: Any) -> None:
+    """Add the ``train`` command to a command line."""
+    parser = subparsers.add_parser("train", help="train a sampler, or go on training it")
+    parser.set_defaults(run=_run_command)
+    parser.add_argument("--task", required=True, choices=models.TASKS)
+    parser.add_argument("--model", required=True, choices=models.KINDS)
+    parser.add_argument("--paper", action="store_true", help="the published architecture")
+    parser.add_argument(
+        "--global", dest="whole_map", action="store_true", help="see the whole map, not a window"
+    )
+    parser.add_argument("--data", required=True, help="folder that nrp data wrote")
+    parser.add_argument("--out", required=True, help="folder for the model, log and curves")
+    parser.add_argument("--epochs", type=int, default=TrainConfig.epochs)
+    parser.add_argument("--batch", type=int, default=TrainConfig.batch, help="queries a step")
+    parser.add_argument("--learning-rate", type=float, default=TrainConfig.learning_rate)
+    parser.add_argument("--patience", type=int, default=TrainConfig.patience, help="epochs")
+    parser.add_argument("--hard", action="store_true", help="labels 0 and 1, none between")
+    parser.add_argument("--seed", type=int, default=TrainConfig.seed)
+
+
+def _run_command(arguments: argparse.Namespace) -> int:
+    make = ModelConfig.published if arguments.paper else ModelConfig.default
+    config = make(arguments.task, arguments.model, "map" if arguments.whole_map else "window")
+    settings = TrainConfig(
+        epochs=arguments.epochs,
+        batch=arguments.batch,
+        learning_rate=arguments.learning_rate,
+        patience=arguments.patience,
+        seed=arguments.seed,
+    )
+    check_settings(settings)
+    robot = load_robot(arguments.task)
+    dataset = load_dataset(arguments.data)
+    soft = not arguments.hard
+    examples = load_examples(config, robot, dataset, soft=soft)
+    stamp = f"{Path(arguments.data).resolve().name}, {len(dataset)} rows, soft {soft}"
+    try:
+        model = train(config, robot, examples, arguments.out, settings=settings, stamp=stamp)
+    except KeyboardInterrupt:
+        print(f"interrupted; the same command goes on from the last epoch in {arguments.out}")
+        return 1
+    figures = ", ".join(f"{name} {value:.4g}" for name, value in model.info["best"].items())
+    print(f"wrote {Path(arguments.out) / 'model.npz'}: {figures}")
+    return 0
+
+
+def check_settings(settings: TrainConfig) -> None:
+    """Raise a ValueError that names the setting out of range."""
+    for name, low, high in (
+        ("epochs", 1, 100_000),
+        ("batch", 1, 65_536),
+        ("learning_rate", 1e-8, 1.0),
+        ("patience", 1, 100_000),
+        ("seed", 0, 2**31),
+    ):
+        value = getattr(settings, name)
+        if not low <= value <= high:
+            raise ValueError(f"{name} is {value}; expected {low} to {high}")
