@@ -42,8 +42,7 @@ class GridWorld(Straight):
     cover: jax.Array  # (L * 12, 3 n) placement of the covering spheres
     cover_radius: jax.Array  # (n,) [m]
     floor: jax.Array  # (n,) lowest height of their centres, -inf if they may touch the floor [m]
-    thin: jax.Array  # (L * 12, 3 m) placement of the spheres checked against each other
-    reach: jax.Array  # (m, m) distance at which two of them touch, 0 for pairs not checked [m]
+    reach: jax.Array  # (m, n) at which the last m touch others, 0 for pairs not checked [m]
     base: RoundBase | None
     field: Field
     lower: jax.Array  # (D,)
@@ -174,9 +173,10 @@ def is_free(world: GridWorld, q: jax.Array) -> jax.Array:
     Joint limits are not looked at; beside the map all is solid. Pure and vmappable.
     """
     poses = link_poses(world.chain, q)
-    thin = place(world.thin, poses)
-    apart = sum((axis[:, None] - axis[None]) ** 2 for axis in thin)
-    centres = place(world.cover, poses)
+    # The barrier keeps XLA's CPU fusions from placing the spheres once for every use.
+    centres = jax.lax.optimization_barrier(place(world.cover, poses))
+    first = world.reach.shape[1] - world.reach.shape[0]
+    apart = sum((axis[first:, None] - axis) ** 2 for axis in centres)
     free = jnp.all(apart >= world.reach**2)
     free &= jnp.all(room(world.field, centres) > world.cover_radius)
     free &= jnp.all(centres[2] > world.floor)
@@ -230,7 +230,6 @@ def build_world(
         "cover": _placement(robot.cover, robot.chain),
         "cover_radius": robot.cover.radius,
         "floor": jnp.asarray(floor, jnp.float32),
-        "thin": _placement(robot.thin, robot.chain),
         "reach": jnp.asarray(_reach(robot)),
         "base": _round_base(robot, grid),
         "field": make_field(grid),
@@ -293,10 +292,11 @@ def _fitting(planar: bool, grid: Grid) -> Grid:
 
 
 def _reach(robot: MobileRobot) -> np.ndarray:
-    radius, (first, second) = np.asarray(robot.thin.radius), np.asarray(robot.pairs).T
+    """Sums of the radii (m, n) of pairs of the last m of n spheres with any; 0 if not checked."""
+    radius, (first, second) = np.asarray(robot.cover.radius), np.asarray(robot.pairs).T
     reach = np.zeros((len(radius),) * 2, np.float32)
-    reach[first, second] = radius[first] + radius[second]
-    return reach
+    reach[second, first] = radius[first] + radius[second]
+    return reach[second.min() :]
 
 
 def _round_base(robot: MobileRobot, grid: Grid) -> RoundBase | None:
