@@ -27,7 +27,7 @@ STARTS_PER_GOAL = 10
 NEAR_GOALS = 0.25  # share of queries whose goal lies inside the window
 CRITICAL = 0.5  # share of starts in the places that most shortest paths pass ...
 NUM_CRITICAL = 100  # ... which are these nodes, as in the authors' code
-_BLOCK, _CHUNK, _LEVELS = 1 << 18, 1 << 13, 7
+_BLOCK, _CHUNK, _LEVELS = 1 << 16, 1 << 12, 7
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

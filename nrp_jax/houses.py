@@ -18,7 +18,7 @@ from nrp_jax.grid import Grid
 
 VERSION = 1  # of the generator; a data set remembers it
 CELLS = {"snake": 100, "fetch": 150}  # sides of the grids
-BODY = {"snake": 10, "fetch": 15}  # cells of height that a robot's base and trunk meet
+BODY = {"snake": 1.0, "fetch": 1.5}  # height that a robot's base and trunk meet [m]
 SPREAD = 4  # cells that placing furniture keeps free around the base
 ERODE = 0.3  # [m] around the base where the free space must be connected
 MIN_ROOMS = 4
@@ -62,14 +62,15 @@ def generate_house(seed: int, kind: str = "snake", clutter: float = 1.0) -> Hous
 
 
 def is_connected(grid: Grid, kind: str) -> bool:
-    """Whether the floor where the base has 0.3 m of air around it is one piece."""
-    return int(ndimage.label(_floor(grid.occupied, kind))[1]) == 1
+    """Whether the floor where a robot's base has 0.3 m of air around it is one piece."""
+    return int(ndimage.label(floor(grid, kind))[1]) == 1
 
 
-def _floor(occupied: np.ndarray, kind: str) -> np.ndarray:
-    plan = occupied[:, :, : BODY[kind]].any(2)
+def floor(grid: Grid, kind: str) -> np.ndarray:
+    """Cells (X, Y) whose centres have 0.3 m of air around them at the heights of a robot's body."""
+    plan = grid.flatten(0.0, BODY[kind]).occupied[:, :, 0]
     # Distances run between centres of cells: half a cell of each belongs to the obstacle.
-    return ndimage.distance_transform_edt(~plan) > 10 * ERODE + 0.5
+    return ndimage.distance_transform_edt(~plan) * grid.resolution > ERODE + 0.5 * grid.resolution
 
 
 def _attempt(rng: np.random.Generator, seed: int, kind: str, clutter: float) -> House:
@@ -77,7 +78,7 @@ def _attempt(rng: np.random.Generator, seed: int, kind: str, clutter: float) -> 
     width, depth = (side, side) if kind == "snake" else rng.integers(120, side + 1, 2).tolist()
     num_rooms = int(rng.integers(4, 7) if kind == "snake" else rng.integers(5, 9))
     plan = make_floor_plan(rng, side, width, depth, num_rooms)
-    draft = _Draft(plan, BODY[kind])
+    draft = _Draft(plan, round(10 * BODY[kind]))
     for door in plan.doors:
         draft.keep_clear(door)
         if max(door.x1 - door.x0, door.y1 - door.y0) <= 12 and rng.random() < 0.35:
@@ -201,7 +202,7 @@ def _scan(rng: np.random.Generator, draft: _Draft, kind: str) -> np.ndarray:
     occupied |= noise & ~draft.clear[:, :, None]
     occupied[[0, -1]] = occupied[:, [0, -1]] = True
     # Places that the base could stand in but never reach are filled.
-    pieces, count = ndimage.label(_floor(occupied, kind))
+    pieces, count = ndimage.label(floor(Grid(occupied=occupied), kind))
     if count > 1:
         sizes = np.bincount(pieces.ravel())[1:]
         lost = (pieces > 0) & (pieces != 1 + int(sizes.argmax()))
