@@ -30,9 +30,8 @@ class Examples:
 
     maps: jax.Array  # (H, X + 40, Y + 40, Z) float16, see :func:`surrounding_map`
     home: jax.Array  # (Q,) i32
-    start: jax.Array  # (Q, D) in the world
-    goal: jax.Array  # (Q, D)
-    waypoints: jax.Array  # (Q, W, D)
+    q: jax.Array  # (Q, 2 + W, D) start, goal and waypoints in the world
+    points: jax.Array  # (Q, 2 + W, F, 3) their link frames [m]
     target: jax.Array  # (Q, W) how good each waypoint is, 0 to 1
     weight: jax.Array  # (Q, W) of the row in the loss, 0 where a query has fewer waypoints
 
@@ -161,15 +160,21 @@ def make_examples(
     table = np.repeat(first[:, None], counts.max(), axis=1)  # empty slots repeat the first row
     table[group[order], slot] = order
     filled = np.arange(counts.max()) < counts[:, None]
+    ends = np.stack([rows["q_start"][first], rows["q_goal"][first]], axis=1)
+    q = np.concatenate([ends, rows["waypoint"][table]], axis=1).astype(np.float32)
+    points = _frames(robot, q.reshape(-1, q.shape[-1]))
     return Examples(
         maps=jnp.asarray(maps),
         home=jnp.asarray(rows["home"][first], jnp.int32),
-        start=jnp.asarray(rows["q_start"][first], jnp.float32),
-        goal=jnp.asarray(rows["q_goal"][first], jnp.float32),
-        waypoints=jnp.asarray(rows["waypoint"][table], jnp.float32),
+        q=jnp.asarray(q),
+        points=points.reshape(*q.shape[:2], *points.shape[1:]),
         target=jnp.asarray(target[table], jnp.float32),
         weight=jnp.asarray(weight[table] * filled, jnp.float32),
     )
+
+
+# Once for all rows: kinematics inside the training step would take longest of all to compile.
+_frames = jax.jit(jax.vmap(link_features, (None, 0)))
 
 
 def _stack(maps: list[jax.Array], config: ModelConfig) -> np.ndarray:
@@ -192,24 +197,23 @@ def make_batch(
 
     Homes have no preferred direction, so every query stands for eight.
     """
-    image, start, goal, waypoints = jax.vmap(lambda index: _local(config, examples, index))(chosen)
+    image, q, points = jax.vmap(lambda index: _local(config, examples, index))(chosen)
     if key is not None:
         symmetry = jax.random.randint(key, (2, len(chosen)), 0, jnp.array([[4], [2]]))
         quarter, mirror = symmetry[0], symmetry[1] == 1
         image = jax.vmap(features.turn_image)(image, quarter, mirror)
-        turn = jax.vmap(lambda q, k, m: features.turn_configuration(robot, q, k, m))
-        start, goal, waypoints = (turn(q, quarter, mirror) for q in (start, goal, waypoints))
-    # One call of the kinematics: it is what takes longest to compile.
-    q = jnp.concatenate([start[:, None], goal[:, None], waypoints], axis=1)
-    points = jax.vmap(jax.vmap(lambda q: link_features(robot, q)))(q)
+        q = jax.vmap(lambda *a: features.turn_configuration(robot, *a))(q, quarter, mirror)
+        points = jax.vmap(features.turn_points)(points, quarter, mirror)
     described = describe(config, robot, q, points)
     return Batch(
         image=image,
         start=described[:, 0],
-        goal=jax.vmap(lambda q, p: features.goal_features(config, robot, q, p))(goal, points[:, 1]),
+        goal=jax.vmap(lambda q, p: features.goal_features(config, robot, q, p))(
+            q[:, 1], points[:, 1]
+        ),
         waypoints=described[:, 2:],
         clearance=jax.vmap(lambda i, q, p: clearances(robot, i, q, p))(
-            image, waypoints, points[:, 2:]
+            image, q[:, 2:], points[:, 2:]
         ),
         target=examples.target[chosen],
         weight=examples.weight[chosen],
@@ -223,15 +227,17 @@ def describe(config: ModelConfig, robot: MobileRobot, q: jax.Array, points: jax.
 
 
 def _local(config: ModelConfig, examples: Examples, index: jax.Array):
-    """Image, start, goal and waypoints of one query, in its local frame."""
-    home, q = examples.home[index], examples.start[index]
+    """Image, configurations (2 + W, D) and link frames of one query, in its local frame."""
+    home, q, points = examples.home[index], examples.q[index], examples.points[index]
     if config.scope == "window":
-        image = context.stacked_window(examples.maps, home, q)
-        centre = context.centre(q)
+        image = context.stacked_window(examples.maps, home, q[0])
+        centre = context.centre(q[0])
     else:
-        image, centre = view(config, examples.maps[home], q, jnp.float32(RESOLUTION), jnp.zeros(2))
-    ends = (q, examples.goal[index], examples.waypoints[index])
-    return image.astype(jnp.float32), *(features.to_local(end, centre) for end in ends)
+        image, centre = view(
+            config, examples.maps[home], q[0], jnp.float32(RESOLUTION), jnp.zeros(2)
+        )
+    points = points - jnp.append(centre, 0.0)
+    return image.astype(jnp.float32), features.to_local(q, centre), points
 
 
 def clearances(robot: MobileRobot, image: jax.Array, q: jax.Array, points: jax.Array) -> jax.Array:

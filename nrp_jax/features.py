@@ -142,10 +142,20 @@ def turn_configuration(
         offset = np.zeros(len(sign))
         clockwise = 1
     q = jnp.where(mirror, sign * q + offset, q)
-    angle = quarter * (jnp.pi / 2)
-    cosine, sine = jnp.round(jnp.cos(angle)), jnp.round(jnp.sin(angle))
-    x, y = q[..., 0], q[..., 1]
-    heading = q[..., HEADING] + clockwise * angle
+    heading = q[..., HEADING] + clockwise * quarter * (jnp.pi / 2)
     heading = jnp.mod(heading + jnp.pi, 2 * jnp.pi) - jnp.pi
-    q = q.at[..., HEADING].set(heading)
-    return q.at[..., 0].set(cosine * x - sine * y).at[..., 1].set(sine * x + cosine * y)
+    return _turn(q.at[..., HEADING].set(heading), quarter)
+
+
+def turn_points(points: jax.Array, quarter: jax.Array, mirror: jax.Array) -> jax.Array:
+    """Turn local points (..., 3) together with the image: see :func:`turn_image`."""
+    sign = jnp.where(mirror, jnp.array([1.0, -1.0, 1.0]), 1.0)
+    return _turn(sign * points, quarter)
+
+
+def _turn(place: jax.Array, quarter: jax.Array) -> jax.Array:
+    """Turn the first two of (..., k) numbers by quarter turns from the first to the second."""
+    cosine = jnp.array([1.0, 0.0, -1.0, 0.0])[quarter]
+    sine = jnp.array([0.0, 1.0, 0.0, -1.0])[quarter]
+    x, y = place[..., 0], place[..., 1]
+    return place.at[..., 0].set(cosine * x - sine * y).at[..., 1].set(sine * x + cosine * y)
