@@ -207,7 +207,7 @@ def _scan(rng: np.random.Generator, draft: _Draft, kind: str) -> np.ndarray:
         sizes = np.bincount(pieces.ravel())[1:]
         lost = (pieces > 0) & (pieces != 1 + int(sizes.argmax()))
         if lost.sum() < 0.05 * sizes.max():
-            occupied[lost, :8] = True
+            occupied[lost & ~draft.clear, :8] = True
     return occupied
 
 
