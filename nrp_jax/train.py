@@ -1,10 +1,8 @@
 """Training of the discriminator and the CVAE."""
 
 import argparse
-import csv
 import dataclasses
 import functools
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import orbax.checkpoint as ocp
 import scipy.stats
 from tqdm import tqdm
 
@@ -22,11 +19,9 @@ from nrp_jax import models
 from nrp_jax.checkpoint import Model, build_module, save_model
 from nrp_jax.data import load_dataset
 from nrp_jax.examples import Batch, Examples, load_examples, make_batch
+from nrp_jax.journal import Keeper, State, claim, plot_curves, waited, write_log
 from nrp_jax.models import ModelConfig
 from nrp_jax.robots import MobileRobot, load_robot
-from vrrt_jax.core.types import pytree
-
-COLUMNS = ("epoch", "train_loss", "loss", "quality", "seconds")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,15 +36,6 @@ class TrainConfig:
     augment: bool = True  # turn and mirror
     validation: float = 0.15  # share of the homes that is held out
     seed: int = 0
-
-
-@pytree
-class State:
-    """What changes as training goes on."""
-
-    variables: Any
-    optimiser: optax.OptState
-    step: jax.Array  # ()
 
 
 def train(
@@ -81,11 +67,13 @@ def train(
         ValueError: ``out`` holds a training of another model, data or settings, or there are too
             few homes to hold some out.
     """
-    out = _claim(Path(out), config, settings, stamp)
+    parts = {"model": dataclasses.asdict(config), "settings": dataclasses.asdict(settings)}
+    out = claim(Path(out), {**parts, "data": stamp})
     training, validation = split_by_home(np.asarray(examples.home), settings)
     sample = make_batch(config, robot, examples, jnp.zeros(1, jnp.int32))
     module = build_module(config, sample.waypoints.shape[-1])
-    steps = settings.epochs * (len(training) // settings.batch)
+    size = min(settings.batch, len(training))
+    steps = settings.epochs * (len(training) // size)
     schedule = optax.warmup_cosine_decay_schedule(
         0.0, settings.learning_rate, min(200, steps // 10 + 1), steps + 1
     )
@@ -100,7 +88,7 @@ def train(
     state, best, history = keeper.restore(state)
 
     def export() -> Model:
-        figures = {key: value for key, value in min(history, key=_loss).items()}
+        figures = min(history, key=lambda row: row["loss"])
         info = {"num_outputs": sample.waypoints.shape[-1], "data": stamp, "best": figures}
         model = Model(config=config, variables=best, info=info)
         save_model(model, out / "model.npz")
@@ -134,13 +122,12 @@ def train(
         disable=not progress,
     )
     for epoch in bar:
-        if _waited(history) >= settings.patience:
+        if waited(history) >= settings.patience:
             break
         started = time.perf_counter()
         order = np.random.default_rng([settings.seed, epoch]).permutation(training)
-        order = order[: len(order) // settings.batch * settings.batch]
         losses = []
-        for chosen in order.reshape(-1, settings.batch):
+        for chosen in order[: len(order) // size * size].reshape(-1, size):
             state, loss = update(state, examples, jnp.asarray(chosen))
             losses.append(loss)
         figures = validate(config, module, robot, state.variables, examples, validation)
@@ -152,11 +139,12 @@ def train(
                 "seconds": round(time.perf_counter() - started, 2),
             }
         )
-        if _waited(history) == 0:
+        if waited(history) == 0:
             best = jax.device_get(state.variables)
             export()
-        keeper.save(state, best, history)
-        _write_log(history, out)
+        finished = len(history) == settings.epochs or waited(history) >= settings.patience
+        keeper.save(state, best, history, last=finished)
+        write_log(history, out)
         bar.set_postfix_str(f"loss {figures['loss']:.4f}, quality {figures['quality']:.3f}")
     keeper.close()
     plot_curves(history, out / "curves.png", f"{config.task} {config.kind}")
@@ -243,96 +231,6 @@ def split_by_home(home: np.ndarray, settings: TrainConfig) -> tuple[np.ndarray, 
     held_out = homes[: max(1, round(settings.validation * len(homes)))]
     is_held_out = np.isin(home, held_out)
     return np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out)
-
-
-class Keeper:
-    """The last epoch on disk, by orbax: a folder appears whole or not at all."""
-
-    def __init__(self, folder: Path):
-        """Look into a folder, or make it."""
-        options = ocp.CheckpointManagerOptions(max_to_keep=1)
-        self._manager = ocp.CheckpointManager(folder.resolve(), options=options)
-
-    def restore(self, state: State) -> tuple[State, Any, list[dict[str, float]]]:
-        """The state, best variables and history of the last epoch; as given if there is none."""
-        best = jax.device_get(state.variables)
-        epoch = self._manager.latest_step()
-        if epoch is None:
-            return state, best, []
-        leaves = ocp.args.StandardRestore({"state": _plain(state), "best": best})
-        arguments = ocp.args.Composite(arrays=leaves, history=ocp.args.JsonRestore())
-        saved = self._manager.restore(epoch, args=arguments)
-        leaves = jax.tree.leaves(saved.arrays["state"])
-        state = jax.tree.unflatten(jax.tree.structure(state), leaves)
-        return state, saved.arrays["best"], saved.history
-
-    def save(self, state: State, best: Any, history: list[dict[str, float]]) -> None:
-        """Write an epoch, then drop the one before."""
-        arrays = ocp.args.StandardSave({"state": _plain(state), "best": best})
-        arguments = ocp.args.Composite(arrays=arrays, history=ocp.args.JsonSave(history))
-        self._manager.save(len(history), args=arguments)
-        self._manager.wait_until_finished()
-
-    def close(self) -> None:
-        """Let go of the folder."""
-        self._manager.close()
-
-
-def _plain(state: State) -> list[jax.Array]:
-    return jax.tree.leaves(state)
-
-
-def _loss(row: dict[str, float]) -> float:
-    return row["loss"]
-
-
-def _waited(history: list[dict[str, float]]) -> int:
-    """Epochs since the best one."""
-    if not history:
-        return 0
-    return len(history) - 1 - int(np.argmin([row["loss"] for row in history]))
-
-
-def _claim(out: Path, config: ModelConfig, settings: TrainConfig, stamp: str) -> Path:
-    """Make the folder ours, or see that it was already."""
-    out.mkdir(parents=True, exist_ok=True)
-    parts = {"model": dataclasses.asdict(config), "settings": dataclasses.asdict(settings)}
-    text = json.dumps({**parts, "data": stamp}, indent=1)
-    file = out / "training.json"
-    if file.exists() and file.read_text() != text:
-        raise ValueError(
-            f"'{out}' holds a training of another model, data set or settings; choose another "
-            "folder with --out, or delete it"
-        )
-    part = file.with_suffix(".part")
-    part.write_text(text)
-    part.replace(file)
-    return out
-
-
-def _write_log(history: list[dict[str, float]], out: Path) -> None:
-    part = out / "log.part"
-    with open(part, "w", newline="") as handle:
-        writer = csv.DictWriter(handle, COLUMNS)
-        writer.writeheader()
-        writer.writerows(history)
-    part.replace(out / "log.csv")
-
-
-def plot_curves(history: list[dict[str, float]], path: Path, title: str) -> None:
-    """Draw training and validation loss, and quality, over the epochs."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 3), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    epochs = [row["epoch"] for row in history]
-    left.plot(epochs, [row["train_loss"] for row in history], label="training homes")
-    left.plot(epochs, [row["loss"] for row in history], label="held-out homes")
-    left.set(xlabel="epoch", ylabel="loss", title=title)
-    left.legend()
-    right.plot(epochs, [row["quality"] for row in history])
-    right.set(xlabel="epoch", ylabel="quality on held-out homes")
-    figure.savefig(path, dpi=120)
 
 
 def add_arguments(subparsers: Any) -> None:
