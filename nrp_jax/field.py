@@ -13,7 +13,7 @@ from scipy import ndimage
 from nrp_jax.grid import Grid
 from vrrt_jax.core.types import pytree
 
-FINE = {2: 4, 3: 2}  # lattice steps a cell, by the map's dimension
+FINE = {2: 8, 3: 2}  # lattice steps a cell, by the map's dimension
 
 
 @pytree

@@ -12,10 +12,10 @@ import vrrt_jax.core
 from vrrt_jax.core.kinematics import Chain, chain_from_model, link_poses
 from vrrt_jax.core.types import Spheres, pytree, static
 
-OBSTACLES = 4  # bit of conaffinity: the geom is checked against obstacles
 FOOTPRINT = "footprint"  # geom of a round base that never tilts: a cylinder, not spheres
 _FILES = {"snake": "snake", "fetch": "fetch_mobile"}  # folders in scenes/robots
-_GRAIN = {"snake": 0.0125, "fetch": 0.05}  # half the side of the bricks that spheres cover [m]
+# Half the side of the bricks that a sphere covers [m], on the base and on the links.
+_GRAIN = {"snake": (0.02, 0.0125), "fetch": (0.05, 0.05)}
 
 
 @pytree
@@ -25,6 +25,16 @@ class Footprint:
     radius: jax.Array  # () [m]
     height: jax.Array  # () of its top [m]
     link: int = static()
+
+
+@pytree
+class Plates:
+    """Flat rectangular links that move in the plane."""
+
+    centre: jax.Array  # (M, 2) in the links' frames [m]
+    half: jax.Array  # (M, 2) half sides [m]
+    link: tuple[int, ...] = static()  # (M,)
+    pairs: tuple[tuple[int, int], ...] = static()  # (P, 2) which are checked against each other
 
 
 @pytree
@@ -39,8 +49,8 @@ class MobileRobot:
     upper: jax.Array  # (A,) [rad] or [m]
     wraps: jax.Array  # (D,) bool, joints that turn for ever
     cover: Spheres  # cover the robot but for its footprint: checked against obstacles
-    thin: Spheres  # checked against each other
-    pairs: jax.Array  # (P, 2) i32 indices into ``thin``: which of them
+    pairs: jax.Array  # (P, 2) i32 indices into ``cover``: which are checked against each other
+    plates: Plates | None  # checked against each other instead, if there are any
     footprint: Footprint | None
     feature_link: jax.Array  # (F,) i32
     feature_point: jax.Array  # (F, 3) in the link's frame [m]
@@ -89,13 +99,16 @@ def load_robot(name: str) -> MobileRobot:
     chain, body_link, body_in_link = chain_from_model(model)
     planar = name == "snake"
     base_dim = 2 if planar else 3
-
-    def spheres(wanted: np.ndarray) -> tuple[Spheres, np.ndarray]:
-        return _cover(model, wanted, body_link, body_in_link, planar=planar, grain=_GRAIN[name])
-
     is_footprint = np.array([model.geom(g).name == FOOTPRINT for g in range(model.ngeom)])
-    cover, _ = spheres((model.geom_conaffinity & OBSTACLES > 0) & ~is_footprint)
-    thin, owner = spheres((model.geom_contype > 0) & ~is_footprint)
+    is_base = body_link[model.geom_bodyid] <= base_dim
+    cover, owner = _cover(
+        model,
+        np.flatnonzero(~is_footprint),
+        body_link,
+        body_in_link,
+        planar=planar,
+        grain=np.where(is_base, *_GRAIN[name]),
+    )
     limited = model.jnt_limited.astype(bool)
     lower = np.where(limited, model.jnt_range[:, 0], -np.pi)[base_dim:]
     upper = np.where(limited, model.jnt_range[:, 1], np.pi)[base_dim:]
@@ -107,8 +120,8 @@ def load_robot(name: str) -> MobileRobot:
         upper=jnp.asarray(upper, jnp.float32),
         wraps=jnp.asarray(~limited & (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)),
         cover=cover,
-        thin=thin,
-        pairs=jnp.asarray(_checked_pairs(model, owner), jnp.int32),
+        pairs=jnp.asarray(_checked_pairs(model, owner[: 0 if planar else None]), jnp.int32),
+        plates=_plates(model, body_link, body_in_link) if planar else None,
         footprint=_footprint(model, body_link) if is_footprint.any() else None,
         feature_link=jnp.asarray(body_link[model.site_bodyid], jnp.int32),
         feature_point=jnp.asarray(points, jnp.float32),
@@ -136,22 +149,34 @@ def _footprint(model: mujoco.MjModel, body_link: np.ndarray) -> Footprint:
     )
 
 
+def _plates(model: mujoco.MjModel, body_link: np.ndarray, body_in_link: np.ndarray) -> Plates:
+    geoms = np.flatnonzero(model.geom_contype)
+    body = model.geom_bodyid[geoms]
+    centre = np.einsum("nij,nj->ni", body_in_link[body, :3, :3], model.geom_pos[geoms])
+    return Plates(
+        centre=jnp.asarray((centre + body_in_link[body, :3, 3])[:, :2], jnp.float32),
+        half=jnp.asarray(model.geom_size[geoms, :2], jnp.float32),
+        link=tuple(body_link[body].tolist()),
+        pairs=tuple(map(tuple, _checked_pairs(model, geoms).tolist())),
+    )
+
+
 def _cover(
     model: mujoco.MjModel,
-    wanted: np.ndarray,
+    geoms: np.ndarray,
     body_link: np.ndarray,
     body_in_link: np.ndarray,
     *,
     planar: bool,
-    grain: float,
+    grain: np.ndarray,
 ) -> tuple[Spheres, np.ndarray]:
-    """Spheres that cover the wanted geoms, in the links' frames, and the geom of each."""
+    """Spheres that cover some geoms, in the links' frames, and the geom of each."""
     link, centre, radius, owner = [], [], [], []
-    for geom in np.flatnonzero(wanted):
+    for geom in geoms:
         centres, radii = cover_geom(
             mujoco.mjtGeom(model.geom_type[geom]),
             model.geom_size[geom] * ([1, 1, 0] if planar else [1, 1, 1]),
-            grain,
+            grain[geom],
         )
         body = model.geom_bodyid[geom]
         rotation = np.zeros(9)

@@ -9,7 +9,7 @@ import numpy as np
 from nrp_jax import reeds_shepp
 from nrp_jax.field import Field, make_field, room
 from nrp_jax.grid import Grid
-from nrp_jax.robots import MobileRobot
+from nrp_jax.robots import MobileRobot, Plates
 from vrrt_jax.core.edges import Straight, joint_steps
 from vrrt_jax.core.kinematics import Chain, link_poses, place, placement
 from vrrt_jax.core.types import Spheres, pytree, static
@@ -42,6 +42,7 @@ class GridWorld(Straight):
     cover: jax.Array  # (L * 12, 3 n) placement of the covering spheres
     cover_radius: jax.Array  # (n,) [m]
     floor: jax.Array  # (n,) lowest height of their centres, -inf if they may touch the floor [m]
+    plates: Plates | None  # checked against each other instead
     reach: jax.Array  # (m, n) at which the last m touch others, 0 for pairs not checked [m]
     base: RoundBase | None
     field: Field
@@ -180,12 +181,31 @@ def is_free(world: GridWorld, q: jax.Array) -> jax.Array:
     free = jnp.all(apart >= world.reach**2)
     free &= jnp.all(room(world.field, centres) > world.cover_radius)
     free &= jnp.all(centres[2] > world.floor)
+    if world.plates is not None:
+        free &= _plates_apart(world.plates, poses)
     if world.base is not None:
         free &= _base_is_free(world.base, poses, centres, world.cover_radius, world.floor)
     return free
 
 
 batch_is_free = jax.jit(jax.vmap(is_free, (None, 0)))  # of q (n, D), for the host
+
+
+def _plates_apart(plates: Plates, poses: jax.Array) -> jax.Array:
+    """Whether no two of the checked plates overlap: some side separates them."""
+    pose = poses[jnp.array(plates.link)]
+    cosine, sine = pose[:, 0, 0], pose[:, 1, 0]
+    centre = jnp.einsum("mij,mj->mi", pose[:, :2, :2], plates.centre) + pose[:, :2, 3]
+    pairs = jnp.array(plates.pairs).T
+    (c_i, c_j), (s_i, s_j), (half_i, half_j) = cosine[pairs], sine[pairs], plates.half[pairs]
+    turned = jnp.abs(jnp.stack([c_i * c_j + s_i * s_j, c_i * s_j - s_i * c_j]))
+    dx, dy = (centre[pairs[1]] - centre[pairs[0]]).T
+    apart = jnp.zeros(len(plates.pairs), bool)
+    for (c, s), own, other in (((c_i, s_i), half_i, half_j), ((c_j, s_j), half_j, half_i)):
+        ahead, beside = jnp.abs(c * dx + s * dy), jnp.abs(c * dy - s * dx)
+        apart |= ahead > own[:, 0] + other[:, 0] * turned[0] + other[:, 1] * turned[1]
+        apart |= beside > own[:, 1] + other[:, 0] * turned[1] + other[:, 1] * turned[0]
+    return jnp.all(apart)
 
 
 def _base_is_free(
@@ -230,6 +250,7 @@ def build_world(
         "cover": _placement(robot.cover, robot.chain),
         "cover_radius": robot.cover.radius,
         "floor": jnp.asarray(floor, jnp.float32),
+        "plates": robot.plates,
         "reach": jnp.asarray(_reach(robot)),
         "base": _round_base(robot, grid),
         "field": make_field(grid),
@@ -294,6 +315,8 @@ def _fitting(planar: bool, grid: Grid) -> Grid:
 def _reach(robot: MobileRobot) -> np.ndarray:
     """Sums of the radii (m, n) of pairs of the last m of n spheres with any; 0 if not checked."""
     radius, (first, second) = np.asarray(robot.cover.radius), np.asarray(robot.pairs).T
+    if not len(first):
+        return np.zeros((0, len(radius)), np.float32)
     reach = np.zeros((len(radius),) * 2, np.float32)
     reach[second, first] = radius[first] + radius[second]
     return reach[second.min() :]

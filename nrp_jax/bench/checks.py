@@ -55,6 +55,8 @@ class SphereLoop:
         apart = np.linalg.norm(centre[first] - centre[second], axis=1)
         if (apart < self.radius[first] + self.radius[second]).any():
             return False
+        if robot_plates_overlap(self.robot, pose):
+            return False
         if (centre[self.falls, 2] <= self.radius[self.falls]).any():
             return False
         if any(self._hits(c, r) for c, r in zip(centre, self.radius, strict=True)):
@@ -96,6 +98,30 @@ class SphereLoop:
         if (gap[self.falls] < self.radius[self.falls]).any():
             return False
         return not self._hits(position, radius, top=height)
+
+
+def robot_plates_overlap(robot: MobileRobot, poses: np.ndarray) -> bool:
+    """Whether checked plates overlap: no side of either has all corners of the other beyond it."""
+    if robot.plates is None:
+        return False
+    corners = []
+    for link, centre, half in zip(
+        robot.plates.link,
+        *(np.asarray(a) for a in (robot.plates.centre, robot.plates.half)),
+        strict=True,
+    ):
+        local = centre + half * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
+        corners.append(local @ poses[link, :2, :2].T + poses[link, :2, 3])
+    for i, j in robot.plates.pairs:
+        both = (corners[i], corners[j])
+        normals = [turned for c in both for turned in np.diff(c[:3], axis=0)]
+        if all(
+            (both[0] @ n).max() >= (both[1] @ n).min()
+            and (both[1] @ n).max() >= (both[0] @ n).min()
+            for n in normals
+        ):
+            return True
+    return False
 
 
 def run(robot: MobileRobot, grid: Grid, num: int = 10_000, timed: int = 500) -> dict:
