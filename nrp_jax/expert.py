@@ -28,6 +28,7 @@ NEAR_GOALS = 0.25  # share of queries whose goal lies inside the window
 CRITICAL = 0.5  # share of starts in the places that most shortest paths pass ...
 NUM_CRITICAL = 100  # ... which are these nodes, as in the authors' code
 _BLOCK, _CHUNK, _LEVELS = 1 << 16, 1 << 12, 7
+_DRAWS = 500  # chunks of samples
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,7 +87,7 @@ def build_roadmap(
 
 def _sample(world: GridWorld, key: jax.Array, num: int) -> tuple[np.ndarray, np.ndarray]:
     free, colliding, found = [], [], 0
-    for draw in range(1000):
+    for draw in range(1, _DRAWS + 1):
         q = sample_configurations(world, jax.random.fold_in(key, draw), _CHUNK)
         ok, q = np.asarray(batch_is_free(world, q)), np.asarray(q)
         free.append(q[ok])
@@ -94,9 +95,11 @@ def _sample(world: GridWorld, key: jax.Array, num: int) -> tuple[np.ndarray, np.
         found += int(ok.sum())
         if found >= num:
             return np.concatenate(free)[:num], np.concatenate(colliding)[:num]
+        if draw >= _DRAWS // 20 and found * _DRAWS < num * draw:
+            break
     raise ValueError(
-        f"only {found} of {1000 * _CHUNK} configurations in this home are free; wanted {num}: "
-        "check the map's resolution and which cells are solid"
+        f"only {found} of {draw * _CHUNK} configurations in this home are free, too few to find "
+        f"{num}: check the map's resolution and which cells are solid"
     )
 
 

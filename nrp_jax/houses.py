@@ -159,10 +159,10 @@ def _furnish(rng: np.random.Generator, draft: _Draft, room: Room, clutter: float
     for name in needs:
         _try(rng, draft, room, name, tries=12)
     square_metres = room.area / 100
-    count = rng.poisson(clutter * square_metres * (0.1 if room.kind == "corridor" else 0.22))
+    count = rng.poisson(clutter * square_metres * (0.1 if room.kind == "corridor" else 0.16))
     for name in rng.choice(fillers, count):
         _try(rng, draft, room, str(name), tries=6)
-    for _ in range(rng.poisson(clutter * square_metres * 0.12)):
+    for _ in range(rng.poisson(clutter * square_metres * 0.08)):
         _try(rng, draft, room, "clutter", tries=4)
     for _ in range(rng.poisson(square_metres * 0.08)):
         _try(rng, draft, room, "wall shelf", tries=3)
@@ -194,7 +194,7 @@ def _scan(rng: np.random.Generator, draft: _Draft, kind: str) -> np.ndarray:
     plan = draft.walls.shape
     beside = ndimage.binary_dilation(occupied, np.ones((3, 3, 1), bool)) & ~occupied
     # Rags hang together over half a metre of height.
-    ragged = np.repeat(rng.random((*plan, 4)) < 0.17, HEIGHT // 4, axis=2)
+    ragged = np.repeat(rng.random((*plan, 4)) < 0.13, HEIGHT // 4, axis=2)
     blobs = ndimage.binary_dilation(rng.random(plan) < 0.002, iterations=2)
     near_wall = ndimage.binary_dilation(draft.walls, iterations=2)
     specks = rng.random(plan) < 0.0015
