@@ -1,12 +1,10 @@
 """A small data set with a real rule behind it: can the base go straight to the waypoint?"""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax.grid import make_grid
 from nrp_jax.robots import load_robot
-from nrp_jax.world import batch_is_free, build_world, sample_configurations
+from nrp_jax.world import batch_is_free, build_world
 
 
 def random_grid(seed: int, size: int = 60, height: int = 1, boxes: int = 14):
@@ -21,26 +19,34 @@ def random_grid(seed: int, size: int = 60, height: int = 1, boxes: int = 14):
     return make_grid(occupied)
 
 
+def free(world, q: np.ndarray) -> np.ndarray:
+    """Which configurations (n, D) are free, in blocks of one size: one program for all."""
+    block = 2048
+    padded = np.resize(q, (-(-len(q) // block) * block, q.shape[1])).astype(np.float32)
+    parts = [batch_is_free(world, part) for part in padded.reshape(-1, block, q.shape[1])]
+    return np.concatenate(parts)[: len(q)]
+
+
 def synthetic_rows(homes: int = 4, queries: int = 24, waypoints: int = 6, seed: int = 0):
     """Grids and rows of the snake; ``good`` tells whether the straight edge is free."""
     robot = load_robot("snake")
     grids = [random_grid(seed + k) for k in range(homes)]
     rows = {name: [] for name in ("q_start", "q_goal", "waypoint", "home", "query", "good")}
     for home, grid in enumerate(grids):
+        rng = np.random.default_rng(seed + home)
         world = build_world(robot, grid)
-        key_free, key_waypoint = jax.random.split(jax.random.key(seed + home))
-        q = sample_configurations(world, key_free, 4096)
-        q = q[batch_is_free(world, q)][: 2 * queries]
+        lower, upper = np.asarray(world.lower), np.asarray(world.upper)
+        q = rng.uniform(lower, upper, (4096, 8)).astype(np.float32)
+        q = q[free(world, q)][: 2 * queries]
         assert len(q) == 2 * queries
-        start = jnp.repeat(q[:queries], waypoints, axis=0)
-        waypoint = sample_configurations(world, key_waypoint, len(start))
-        near = start[:, :2] + 1.5 * jax.random.uniform(key_waypoint, (len(start), 2), minval=-1)
-        waypoint = waypoint.at[:, :2].set(near)
-        fraction = jnp.linspace(0, 1, 20)[:, None, None]
+        start = np.repeat(q[:queries], waypoints, axis=0)
+        waypoint = rng.uniform(lower, upper, start.shape).astype(np.float32)
+        waypoint[:, :2] = start[:, :2] + rng.uniform(-1.5, 1.5, (len(start), 2))
+        fraction = np.linspace(0, 1, 20)[:, None, None]
         edge = start + fraction * (waypoint - start)
-        good = batch_is_free(world, edge.reshape(-1, 8)).reshape(20, -1).all(axis=0)
+        good = free(world, edge.reshape(-1, 8)).reshape(20, -1).all(axis=0)
         rows["q_start"].append(start)
-        rows["q_goal"].append(jnp.repeat(q[queries:], waypoints, axis=0))
+        rows["q_goal"].append(np.repeat(q[queries:], waypoints, axis=0))
         rows["waypoint"].append(waypoint)
         rows["home"].append(np.full(len(start), home))
         rows["query"].append(np.repeat(np.arange(queries), waypoints))

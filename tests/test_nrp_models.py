@@ -117,12 +117,13 @@ def test_images_show_what_surrounds_the_start():
     padded = surrounding_map(config, world)
     q = jnp.zeros(8).at[:2].set(jnp.array([1.23, 4.77]))
     image, centre = view(config, padded, q, jnp.float32(RESOLUTION), jnp.zeros(2))
+    image = np.asarray(image)
     np.testing.assert_allclose(centre, [1.2, 4.8], atol=1e-6)
     for cell in np.ndindex(40, 40):
         place = np.round(np.asarray(centre) / RESOLUTION).astype(int) - 20 + cell
         inside = (place >= 0).all() and (place < 60).all()
         solid = not inside or grid.occupied[place[0], place[1], 0]
-        assert (float(image[cell]) == 0.0) == solid
+        assert (image[*cell, 0] == 0.0) == solid
     whole, middle = view(
         ModelConfig.default("snake", "cvae", "map"), padded, q, jnp.float32(0.1), jnp.zeros(2)
     )
@@ -139,7 +140,9 @@ def test_clearances_are_read_where_the_robot_would_be():
     points = jax.vmap(lambda q: link_features(robot, q))(q)
     read = np.asarray(clearances(robot, image, q, points))[0]
     cells = [(24, int(np.floor((-0.45 + 0.12 * k) / 0.1)) + 20) for k in range(1, 7)]
-    way = [(20 + int(np.floor(4.5 * f)), 20 + int(np.floor(-4.5 * f))) for f in (0.25, 0.5, 0.75, 1)]
+    way = [
+        (20 + int(np.floor(4.5 * f)), 20 + int(np.floor(-4.5 * f))) for f in (0.25, 0.5, 0.75, 1)
+    ]
     np.testing.assert_array_equal(read, [40 * i + j for i, j in cells + way])
 
 
@@ -158,7 +161,9 @@ def test_candidates_are_judged_one_by_one():
 
 def test_losses_by_hand():
     mask = jnp.array([[1.0, 1.0, 0.0]])
-    loss = models.discriminator_loss(jnp.array([[0.0, 2.0, 9.0]]), jnp.array([[1.0, 0.0, 0.0]]), mask)
+    loss = models.discriminator_loss(
+        jnp.array([[0.0, 2.0, 9.0]]), jnp.array([[1.0, 0.0, 0.0]]), mask
+    )
     np.testing.assert_allclose(loss, (np.log(2) + np.log1p(np.exp(2))) / 2, rtol=1e-6)
     config = ModelConfig.default("snake", "cvae")
     waypoints = jnp.zeros((1, 3, 2))
