@@ -58,7 +58,7 @@ def test_homes_are_held_out_whole():
 
 
 def test_the_discriminator_learns_and_goes_on_after_a_kill(rows, tmp_path):
-    """It learns what is free in homes that it has not seen; a killed run ends as an unbroken one."""
+    """It learns what is free in unseen homes; a killed run ends as an unbroken one."""
     config = ModelConfig.default("snake", "discriminator")
     robot, examples = examples_of(config, rows)
     model = train(config, robot, examples, tmp_path / "a", settings=SETTINGS, progress=False)
