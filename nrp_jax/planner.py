@@ -23,6 +23,7 @@ from vrrt_jax.core.types import Rejection, Tree
 
 METHODS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g")
 ARRIVED = 1e-4  # from the goal, which a node either is or is not
+ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
 
 
 class Status(enum.Enum):
@@ -97,6 +98,9 @@ def plan(
 ) -> PlanResult:
     """Find a collision-free path between two configurations in a home.
 
+    Should the path that was found touch something between two of the planner's checks, it plans
+    again with checks twice as fine, up to twice.
+
     Args:
         robot: from :func:`nrp_jax.load_robot`.
         grid: from :func:`nrp_jax.load_map` or a generator.
@@ -123,19 +127,26 @@ def plan(
     goal = check_configuration(robot, world, q_goal, "goal")
     make = {"goal_bias": goal_bias, "straight_rate": straight_rate, "lanes": lanes}
     policy, tree = _setup(world, start, goal, method, sampler, make, capacity)
-    found = search(
-        world,
-        policy,
-        tree,
-        key=key,
-        stop=make_stop(ARRIVED, max_iterations=max(max_expansions // lanes, 1)),
-        time_limit_s=time_limit_s,
-        on_progress=on_progress,
-    )
-    raw = connection_path(found.tree) if method == "rrt-connect" else tree_path(found.tree)
-    reached = raw is not None and found.stopped is Stopped.REACHED
-    raw = np.asarray(start)[None] if raw is None else raw
-    return _finish(robot, grid, world, found, raw, reached, key, lanes, scene)
+    scene, spent = scene or ExactScene(robot, grid), {}
+    for attempt in range(ATTEMPTS):
+        found = search(
+            world,
+            policy,
+            tree,
+            key=jax.random.fold_in(key, attempt),
+            stop=make_stop(ARRIVED, max_iterations=max(max_expansions // lanes, 1)),
+            time_limit_s=time_limit_s,
+            on_progress=on_progress,
+        )
+        raw = connection_path(found.tree) if method == "rrt-connect" else tree_path(found.tree)
+        reached = raw is not None and found.stopped is Stopped.REACHED
+        raw = np.asarray(start)[None] if raw is None else raw
+        result = _finish(scene, world, found, raw, reached, key, lanes)
+        spent = {name: spent.get(name, 0.0) + value for name, value in result.timing.items()}
+        if result.status is not Status.NOT_VERIFIED:
+            break
+        world = dataclasses.replace(world, resolution=world.resolution / 2)
+    return dataclasses.replace(result, timing=spent)
 
 
 def check_configuration(
@@ -227,26 +238,25 @@ def _setup(
 
 
 def _finish(
-    robot: MobileRobot,
-    grid: Grid,
+    scene: ExactScene,
     world: GridWorld,
     found: SearchResult,
     raw: np.ndarray,
     reached: bool,
     key: jax.Array,
     lanes: int,
-    scene: ExactScene | None,
 ) -> PlanResult:
     """Shorten and verify what a search found."""
     clock = [time.perf_counter()]
     path, verification = raw, None
     if reached:
-        path = shortcut(world, raw, key=key)
+        finer = dataclasses.replace(world, resolution=world.resolution / 2)
+        path = shortcut(finer, raw, key=key)
     clock.append(time.perf_counter())
     trajectory = trajectory_of(world, path)
     if reached:
         verification = verify(
-            scene or ExactScene(robot, grid),
+            scene,
             trajectory,
             lower=np.asarray(world.lower),
             upper=np.asarray(world.upper),

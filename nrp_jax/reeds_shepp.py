@@ -22,8 +22,8 @@ _QUARTER = np.pi / 2
 class Curve:
     """Arcs and lines, driven one after the other."""
 
-    drive: jax.Array  # (..., 5) signed lengths in radii, negative in reverse
-    turn: jax.Array  # (..., 5) 1 to the left, -1 to the right, 0 straight on
+    drive: tuple[jax.Array, ...]  # 5 of (...) signed lengths in radii, negative in reverse
+    turn: tuple[jax.Array, ...]  # 5 of (...) 1 to the left, -1 to the right, 0 straight on
 
 
 def length(a: jax.Array, b: jax.Array, radius: jax.Array | float) -> jax.Array:
@@ -34,48 +34,51 @@ def length(a: jax.Array, b: jax.Array, radius: jax.Array | float) -> jax.Array:
         b: (..., 3) goals.
         radius: smallest turning radius [m].
     """
-    return _best(_goal_in_start(a, b, radius))[0] * radius
+    return jnp.min(_candidates(_goal_in_start(a, b, radius))[0], axis=0) * radius
 
 
 def shortest(a: jax.Array, b: jax.Array, radius: jax.Array | float) -> Curve:
     """The shortest paths (...) between poses (..., 3); see :func:`length`."""
     # The barrier keeps XLA's CPU fusions from finding the word anew for every number of the curve.
-    _, numbers, choice = jax.lax.optimization_barrier(_best(_goal_in_start(a, b, radius)))
+    candidates = jax.lax.optimization_barrier(_candidates(_goal_in_start(a, b, radius)))
+    choice = jnp.argmin(candidates[0], axis=0)
+    numbers = [jnp.take_along_axis(n, choice[None], axis=0)[0] for n in candidates[1:]]
     word, mirror = choice // 4, choice % 4
     backwards, mirrored = 1 - 2 * (mirror % 2), 1 - 2 * (mirror // 2)
-    numbers = jnp.stack([*numbers, jnp.full_like(numbers[0], _QUARTER)], axis=-1)
-    drive = jnp.sum(jnp.asarray(_DRIVE)[word] * numbers[..., None, :], axis=-1)
+    row = jnp.asarray(_TABLE)[word]  # (..., 25)
+    numbers.append(jnp.full_like(numbers[0], _QUARTER))
+    drive = [sum(row[..., 5 * k + i] * n for k, n in enumerate(numbers)) for i in range(5)]
     return Curve(
-        drive=drive * backwards[..., None],
-        turn=jnp.asarray(_TURN)[word] * mirrored[..., None],
+        drive=tuple(d * backwards for d in drive),
+        turn=tuple(row[..., 20 + i] * mirrored for i in range(5)),
     )
 
 
 def curve_length(curve: Curve) -> jax.Array:
     """Lengths (...) in radii."""
-    return jnp.sum(jnp.abs(curve.drive), axis=-1)
+    return sum((jnp.abs(drive) for drive in curve.drive[1:]), jnp.abs(curve.drive[0]))
 
 
 def cut(curve: Curve, fraction: jax.Array) -> Curve:
     """The first fraction (...) of curves."""
-    size = jnp.abs(curve.drive)
-    before = jnp.cumsum(size, axis=-1) - size
-    left = (fraction * jnp.sum(size, axis=-1))[..., None] - before
-    drive = jnp.sign(curve.drive) * jnp.clip(left, 0.0, size)
-    return Curve(drive=drive, turn=jnp.broadcast_to(curve.turn, drive.shape))
+    left, drives = fraction * curve_length(curve), []
+    for drive in curve.drive:
+        size = jnp.abs(drive)
+        drives.append(jnp.sign(drive) * jnp.clip(left, 0.0, size))
+        left = left - size
+    turns = tuple(jnp.broadcast_to(turn, left.shape) for turn in curve.turn)
+    return Curve(drive=tuple(drives), turn=turns)
 
 
 def follow(a: jax.Array, curve: Curve, radius: jax.Array | float) -> jax.Array:
     """Poses (..., 3) at the ends of curves that begin at poses (..., 3)."""
     x, y, heading = a[..., 0], a[..., 1], a[..., 2]
-    for k in range(5):
-        drive, turn = curve.drive[..., k] * radius, curve.turn[..., k]
-        after = heading + curve.drive[..., k] * turn
-        # An arc is as long as its chord is long, in the middle heading: chord = 2 r sin(angle / 2)
-        half = curve.drive[..., k] * turn / 2
-        chord = drive * jnp.sinc(half / jnp.pi)
+    for drive, turn in zip(curve.drive, curve.turn, strict=True):
+        half = drive * turn / 2
+        # An arc ends where its chord does, which points in the middle heading: 2 r sin(half angle).
+        chord = radius * jnp.where(turn == 0, drive, 2 * jnp.sin(jnp.abs(half)) * jnp.sign(drive))
         x, y = x + chord * jnp.cos(heading + half), y + chord * jnp.sin(heading + half)
-        heading = after
+        heading = heading + 2 * half
     return jnp.stack([x, y, heading], axis=-1)
 
 
@@ -97,26 +100,24 @@ def _wrap(angle: jax.Array) -> jax.Array:
     return angle - 2 * jnp.pi * jnp.floor((angle + jnp.pi) / (2 * jnp.pi))
 
 
-def _best(goal: tuple) -> tuple[jax.Array, tuple, jax.Array]:
-    """Length (...), numbers t, u, v (...) and index (...) of the shortest candidate.
+def _candidates(goal: tuple) -> tuple[jax.Array, ...]:
+    """Lengths and numbers t, u, v (W, ...) of all candidates.
 
-    The index is four times the word's, plus 1 if driven backwards and 2 if mirrored.
+    Index ``4 w + m`` is word w, driven backwards if m is odd and mirrored if m is 2 or 3.
     """
+    back, flip = (
+        np.reshape(s, (4,) + (1,) * goal[0].ndim).astype(np.float32)
+        for s in ([1, -1, 1, -1], [1, 1, -1, -1])
+    )
     x, y, phi = goal
     c, s = jnp.cos(phi), jnp.sin(phi)
     seen_from_goal = (x * c + y * s, x * s - y * c)
-    best = jnp.full(x.shape, jnp.inf, x.dtype)
-    numbers, choice = (jnp.zeros_like(x),) * 3, jnp.zeros(x.shape, jnp.int32)
-    for word, (formula, from_goal, *_) in enumerate(_WORDS):
+    found = []
+    for formula, from_goal, *_ in _WORDS:
         wx, wy = seen_from_goal if from_goal else (x, y)
-        for mirror in range(4):
-            back, flip = 1 - 2 * (mirror % 2), 1 - 2 * (mirror // 2)
-            total, *found = formula(wx * back, wy * flip, phi * (back * flip), c, s * (back * flip))
-            shorter = total < best
-            best = jnp.where(shorter, total, best)
-            numbers = tuple(jnp.where(shorter, n, m) for n, m in zip(found, numbers, strict=True))
-            choice = jnp.where(shorter, 4 * word + mirror, choice)
-    return best, numbers, choice
+        mirrors = (wx * back, wy * flip, phi * (back * flip))
+        found.append(formula(*mirrors, jnp.broadcast_to(c, mirrors[0].shape), s * (back * flip)))
+    return tuple(jnp.concatenate(column) for column in zip(*found, strict=True))
 
 
 # The formulas, numbered as in the paper: from the goal's pose (x, y, phi) with the cosine and sine
@@ -227,8 +228,8 @@ _WORDS: tuple[tuple[Callable, bool, str, tuple], ...] = (
     (_left_right_straight_right, True, "RSRL", (_V, _U, -_Q, _T)),
     (_left_right_straight_left_right, False, "LRSLR", (_T, -_Q, _U, -_Q, _V)),
 )
-_TURN = np.zeros((len(_WORDS), 5), np.float32)  # 1, -1 or 0 for each piece
-_DRIVE = np.zeros((len(_WORDS), 5, 4), np.float32)
-for _row, (_, _, _letters, _drives) in enumerate(_WORDS):
-    _TURN[_row, : len(_letters)] = [{"L": 1, "R": -1, "S": 0}[letter] for letter in _letters]
-    _DRIVE[_row, : len(_drives)] = _drives
+# One row a word: for each of t, u, v and a quarter turn its five multiples, and the five turns.
+_TABLE = np.zeros((len(_WORDS), 25), np.float32)
+for _row, (_, _, _letters, _drives) in zip(_TABLE, _WORDS, strict=True):
+    _row[:20].reshape(4, 5)[:, : len(_drives)] = np.transpose(_drives)
+    _row[20 : 20 + len(_letters)] = [{"L": 1, "R": -1, "S": 0}[letter] for letter in _letters]
