@@ -13,10 +13,10 @@ import numpy as np
 
 from nrp_jax import context, features
 from nrp_jax.data import Dataset
+from nrp_jax.field import Field, make_field
 from nrp_jax.grid import Grid
 from nrp_jax.models import ModelConfig
 from nrp_jax.robots import MobileRobot, link_features
-from nrp_jax.world import GridWorld, build_world
 from vrrt_jax.core.types import pytree
 
 RESOLUTION = 0.1  # side of a cell, in all that the models have seen [m]
@@ -44,17 +44,17 @@ class Batch:
     start: jax.Array  # (n, E)
     goal: jax.Array  # (n, E')
     waypoints: jax.Array  # (n, W, E'')
-    clearance: jax.Array  # (n, W, P)
+    relation: jax.Array  # (n, W, R), see :func:`relations`
     target: jax.Array  # (n, W)
     weight: jax.Array  # (n, W)
 
 
-def surrounding_map(config: ModelConfig, world: GridWorld) -> jax.Array:
-    """A world's map as the images are cut from it: (X + 40, Y + 40, Z), bordered by solid cells.
+def surrounding_map(config: ModelConfig, field: Field) -> jax.Array:
+    """A field's map as the images are cut from it: (X + 40, Y + 40, Z), bordered by solid cells.
 
     Distances to obstacles [m]; for the published models occupancies.
     """
-    distances = features.surroundings(world.field)
+    distances = features.surroundings(field)
     half = context.SIDE // 2
     border = ((half, half), (half, half), (0, 0))
     distances = jnp.pad(distances, border)
@@ -143,12 +143,12 @@ def make_examples(
     Args:
         config: of the model to train.
         robot: whose configurations they are.
-        grids: H homes; the frames of their maps begin at (0, 0).
+        grids: H homes, planar for a planar robot; their maps begin at (0, 0).
         rows: ``q_start``, ``q_goal``, ``waypoint`` (n, D), ``home`` and ``query`` (n,).
         target: (n,) how good the waypoints are.
         weight: (n,) in the loss.
     """
-    maps = _stack([surrounding_map(config, build_world(robot, grid)) for grid in grids], config)
+    maps = _stack([surrounding_map(config, make_field(grid)) for grid in grids], config)
     _, first, group, counts = np.unique(
         rows["home"].astype(np.int64) << 32 | rows["query"].astype(np.int64),
         return_index=True,
@@ -212,8 +212,8 @@ def make_batch(
             q[:, 1], points[:, 1]
         ),
         waypoints=described[:, 2:],
-        clearance=jax.vmap(lambda i, q, p: clearances(robot, i, q, p))(
-            image, q[:, 2:], points[:, 2:]
+        relation=jax.vmap(functools.partial(relations, robot))(
+            image, q[:, 0], q[:, 1], q[:, 2:], points[:, 2:]
         ),
         target=examples.target[chosen],
         weight=examples.weight[chosen],
@@ -240,7 +240,30 @@ def _local(config: ModelConfig, examples: Examples, index: jax.Array):
     return image.astype(jnp.float32), features.to_local(q, centre), points
 
 
-def clearances(robot: MobileRobot, image: jax.Array, q: jax.Array, points: jax.Array) -> jax.Array:
-    """What an image (X, Y, Z) holds where local waypoints (C, D), with frames, would be: (C, P)."""
-    touched = jax.vmap(lambda q, p: features.clearance_points(robot, q, p))(q, points)
-    return image.reshape(-1)[features.cells(touched, image.shape, RESOLUTION)]
+def relations(
+    robot: MobileRobot,
+    image: jax.Array,
+    start: jax.Array,
+    goal: jax.Array,
+    q: jax.Array,
+    points: jax.Array,
+) -> jax.Array:
+    """How candidates lie to their surroundings and to the ends: (C, R).
+
+    Args:
+        robot: whose configurations they are.
+        image: (X, Y, Z) around the start.
+        start: (D,) local.
+        goal: (D,) local.
+        q: (C, D) local candidates.
+        points: (C, F, 3) their link frames [m].
+
+    Returns:
+        What the image holds where each would be; steps of base and arm from the start and to the
+        goal.
+    """
+    touched = jax.vmap(functools.partial(features.clearance_points, robot))(q, points)
+    clearance = image.reshape(-1)[features.cells(touched, image.shape, RESOLUTION)]
+    return jnp.concatenate(
+        [clearance, features.steps(robot, q, start), features.steps(robot, q, goal)], axis=-1
+    )

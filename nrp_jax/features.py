@@ -106,6 +106,15 @@ def cells(points: jax.Array, shape: tuple[int, ...], resolution: float) -> jax.A
     return (index[..., 0] * shape[1] + index[..., 1]) * shape[2] + index[..., 2]
 
 
+def steps(robot: MobileRobot, q: jax.Array, end: jax.Array) -> jax.Array:
+    """How far base and arm are apart (..., 2) in configurations (..., D) and (D,) [m] and [rad]."""
+    step = q - end
+    step = step - 2 * jnp.pi * jnp.where(robot.wraps, jnp.round(step / (2 * jnp.pi)), 0.0)
+    squared = step**2
+    base, arm = squared[..., :2].sum(-1), squared[..., robot.base_dim :].sum(-1)
+    return jnp.sqrt(jnp.stack([base, arm], axis=-1) + 1e-12)
+
+
 def surroundings(field: Field) -> jax.Array:
     """The map (X, Y, Z) behind a field: distances to obstacles at each cell's middle [m].
 

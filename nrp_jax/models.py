@@ -26,7 +26,7 @@ class ModelConfig:
     channels: tuple[int, ...] = (32, 64)  # width of each encoder layer
     context: int = 128  # width of the layers that join image, start and goal
     width: int = 64  # width of the layers behind, for each candidate or latent
-    lookup: bool = True  # read the image where each candidate would be; windows only
+    lookup: bool = True  # tell what the image holds where each candidate would be; windows only
     latent: int = 8  # dimensions of the CVAE's latent
     kl_weight: float = 0.01  # of the CVAE's KL term
 
@@ -162,7 +162,7 @@ class Discriminator(nn.Module):
         start: jax.Array,
         goal: jax.Array,
         candidates: jax.Array,
-        clearance: jax.Array,
+        relation: jax.Array,
         train: bool = False,
     ) -> jax.Array:
         """Logits (n, C).
@@ -172,7 +172,7 @@ class Discriminator(nn.Module):
             start: (n, E) features.
             goal: (n, E') features.
             candidates: (n, C, E'') features, or (1, C, E'') if all starts share them.
-            clearance: (n, C, P) what the image holds where each candidate would be; unused
+            relation: (n, C, R) to the surroundings and the ends, in numbers; unused
                 without ``lookup``.
             train: normalise by this batch.
         """
@@ -193,7 +193,7 @@ class Discriminator(nn.Module):
         shift, scale = jnp.split(nn.Dense(2 * config.width)(context)[:, None], 2, axis=-1)
         x = nn.Dense(config.width)(candidates)
         if config.lookup:
-            x = x + nn.Dense(config.width, use_bias=False)(clearance)
+            x = x + nn.Dense(config.width, use_bias=False)(relation)
         x = nn.relu(x * (1 + scale) + shift)
         x = nn.relu(nn.Dense(config.width)(x))
         return nn.Dense(1)(x)[..., 0]
@@ -224,13 +224,16 @@ class CVAE(nn.Module):
         context = jnp.concatenate([own, start, goal], axis=-1)
         mean, log_variance = jnp.split(self.encoder(context, waypoints, train), 2, axis=-1)
         z = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
-        context = jnp.concatenate([seen, start, goal], axis=-1)
-        return self.decoder(context, z, train), mean, log_variance
+        return self._decode(seen, start, goal, z, train), mean, log_variance
 
     def decode(self, image, start, goal, z):
         """Waypoint features (n, C, E) for latents (n, C, latent)."""
-        context = jnp.concatenate([self.decoder_image(image, False), start, goal], axis=-1)
-        return self.decoder(context, z, False)
+        return self._decode(self.decoder_image(image, False), start, goal, z, False)
+
+    def _decode(self, seen, start, goal, z, train: bool):
+        made = self.decoder(jnp.concatenate([seen, start, goal], axis=-1), z, train)
+        # What is to be generated is a step away from the start.
+        return made if self.config.paper else made + start[:, None]
 
 
 class Layers(nn.Module):

@@ -4,6 +4,7 @@ Pytrees, so that other weights never re-compile a planner. Letters: ``B`` lanes,
 ``D`` joints, ``E`` features.
 """
 
+import functools
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 from nrp_jax import features
 from nrp_jax.checkpoint import Model, build_module, check_model, load_model
 from nrp_jax.context import SIDE
-from nrp_jax.examples import RESOLUTION, clearances, describe, surrounding_map, view
+from nrp_jax.examples import RESOLUTION, describe, relations, surrounding_map, view
 from nrp_jax.field import FINE
 from nrp_jax.models import CVAE, ModelConfig, check_choices
 from nrp_jax.robots import MobileRobot, link_features, load_robot
@@ -23,7 +24,7 @@ from vrrt_jax.core.types import pytree, static
 
 REACH = SIDE / 2 * RESOLUTION  # of a window from its middle [m]
 POSTURES = 16  # between a start's and a goal's
-SPREAD = 0.3  # of these postures [rad] or [m]
+SPREAD = 1.0  # how far at most a joint is off these postures [rad] or [m]
 
 
 class Sampler(Protocol):
@@ -41,7 +42,8 @@ class Discriminator:
     """NRP-d: the best of many random candidates, in the eyes of the discriminator.
 
     Half of the candidates have any posture, half one between the start's and the goal's. The goal
-    itself is one where it lies in the window.
+    itself is one where it lies in the window. Those that stand in something solid, or behind it on
+    the straight line, are out before the network looks.
     """
 
     robot: MobileRobot
@@ -49,7 +51,8 @@ class Discriminator:
     config: ModelConfig = static()
     candidates: int = static(default=500)
     along: float = static(default=0.5)  # share of candidates with a posture between the ends'
-    checked: int = static(default=1)  # of the best, the first whose edge seems free is taken
+    judged: int = static(default=192)  # most that the network looks at
+    checked: int = static(default=4)  # of the best, the first whose edge seems free is taken
     edge_checks: int = static(default=4)  # configurations looked at along each of these edges
 
     def propose(
@@ -62,13 +65,20 @@ class Discriminator:
             shift = jnp.pad(features.to_local(q_from, sight.centre)[:, :2], ((0, 0), (0, 1)))
             q = q.at[..., :2].add(shift[:, None, :2])
             points = points + shift[:, None, None]
-        q = jnp.concatenate([q, sight.goal_q[:, None]], axis=1)
-        points = jnp.concatenate([points, sight.goal_points[:, None]], axis=1)
+        q = jnp.concatenate([sight.goal_q[:, None], q], axis=1)
+        points = jnp.concatenate([sight.goal_points[:, None], points], axis=1)
         near = jnp.max(jnp.abs(q_goal - q_from)[:, :2], axis=1) < REACH
-        possible = jnp.ones(q.shape[:2], bool).at[:, -1].set(near)
-        clearance = jax.vmap(lambda i, q, p: clearances(self.robot, i, q, p))(
-            sight.image, q, points
+        possible = jnp.ones(q.shape[:2], bool).at[:, 0].set(near)
+        relation = jax.vmap(functools.partial(relations, self.robot))(
+            sight.image, sight.start_q, sight.goal_q, q, points
         )
+        if self.config.lookup and self.judged < q.shape[1]:
+            blocked = jnp.min(relation[..., :-4], axis=-1) <= 0
+            rank = jnp.where(possible, jnp.where(blocked, 1.0, 2.0), 0.0)
+            _, kept = jax.lax.top_k(rank, self.judged)
+            q, points, relation, possible = jax.vmap(
+                lambda kept, arrays: jax.tree.map(lambda x: x[kept], arrays)
+            )(kept, (q, points, relation, possible))
         module = build_module(self.config, 0)
         logits = module.apply(
             self.variables,
@@ -76,9 +86,10 @@ class Discriminator:
             sight.start,
             sight.goal,
             describe(self.config, self.robot, q, points),
-            clearance,
+            relation,
         )
-        _, best = jax.lax.top_k(jnp.where(possible, logits, -jnp.inf), self.checked)
+        many = min(self.checked, q.shape[1])
+        _, best = jax.lax.top_k(jnp.where(possible, logits, -jnp.inf), many)
         chosen = jnp.take_along_axis(q, best[..., None], axis=1)
         chosen = into_limits(world, features.to_world(chosen, sight.centre[:, None]))
         return _first_free(world, q_from, chosen, self.edge_checks)
@@ -94,18 +105,18 @@ class Discriminator:
         low, high = world.lower.at[:2].set(-REACH), world.upper.at[:2].set(REACH)
         q = jax.random.uniform(key_any, (num_any, len(low)), minval=low, maxval=high)
         both = (q, jax.vmap(lambda q: link_features(self.robot, q))(q))
-        parts = [jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), both)]
-        if num_along:
-            q = _postures(self.robot, world, q_from, q_goal, key_posture)
-            frames = jax.vmap(jax.vmap(lambda q: link_features(self.robot, q)))(q)
-            place = jax.random.uniform(
-                key_place, (lanes, num_along, POSTURES, 2), minval=-REACH, maxval=REACH
-            )
-            q = jnp.broadcast_to(q[:, None], (*place.shape[:3], q.shape[-1]))
-            frames = frames[:, None] + jnp.pad(place, [(0, 0)] * 3 + [(0, 1)])[..., None, :]
-            both = (q.at[..., :2].set(place), frames)
-            parts.append(jax.tree.map(lambda x: x.reshape(lanes, -1, *x.shape[3:]), both))
-        return jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *parts)
+        anywhere = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), both)
+        if not num_along:
+            return anywhere
+        q = _postures(self.robot, world, q_from, q_goal, key_posture)
+        frames = jax.vmap(jax.vmap(lambda q: link_features(self.robot, q)))(q)
+        place = jax.random.uniform(
+            key_place, (lanes, num_along, POSTURES, 2), minval=-REACH, maxval=REACH
+        )
+        q = jnp.broadcast_to(q[:, None], (*place.shape[:3], q.shape[-1])).at[..., :2].set(place)
+        frames = frames[:, None] + jnp.pad(place, [(0, 0)] * 3 + [(0, 1)])[..., None, :]
+        along = jax.tree.map(lambda x: x.reshape(lanes, -1, *x.shape[3:]), (q, frames))
+        return jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), along, anywhere)
 
 
 @pytree
@@ -142,6 +153,7 @@ class _Sight:
     centre: jax.Array  # (B, 2) of the local frames [m]
     start: jax.Array  # (B, E)
     goal: jax.Array  # (B, E')
+    start_q: jax.Array  # (B, D) local
     goal_q: jax.Array  # (B, D) local
     goal_points: jax.Array  # (B, F, 3) local
 
@@ -149,7 +161,7 @@ class _Sight:
 def _look(
     config: ModelConfig, robot: MobileRobot, world: GridWorld, q_from: jax.Array, q_goal: jax.Array
 ) -> _Sight:
-    padded = surrounding_map(config, world)
+    padded = surrounding_map(config, world.field)
     fine = FINE[2 if robot.planar else 3]
     resolution = world.field.step * fine
     origin = world.field.origin[:2] + resolution  # the field has a rim of one cell
@@ -164,6 +176,7 @@ def _look(
         goal=jax.vmap(lambda q, p: features.goal_features(config, robot, q, p))(
             ends[:, 1], points[:, 1]
         ),
+        start_q=ends[:, 0],
         goal_q=ends[:, 1],
         goal_points=points[:, 1],
     )
@@ -176,12 +189,14 @@ def _postures(
 
     A base that turns heads anywhere.
     """
-    step = difference(world, q_from, q_goal)[:, None]  # type: ignore[arg-type]
+    step = difference(world, q_from, q_goal)[:, None]
     q = q_from[:, None] + jnp.linspace(0.0, 1.0, POSTURES)[:, None] * step
-    noise = jax.random.uniform(key, q.shape, minval=-1.0, maxval=1.0)
+    key_noise, key_scale = jax.random.split(key)
+    noise = jax.random.uniform(key_noise, q.shape, minval=-1.0, maxval=1.0)
+    scale = SPREAD * jax.random.uniform(key_scale, (*q.shape[:2], 1)) ** 2
     base = jnp.arange(q.shape[-1]) < robot.base_dim
-    q = jnp.where(base, jnp.pi * noise, q + SPREAD * noise)
-    return into_limits(world, q.at[..., :2].set(0.0)).at[..., :2].set(0.0)  # type: ignore[arg-type]
+    q = jnp.where(base, jnp.pi * noise, q + scale * noise)
+    return into_limits(world, q.at[..., :2].set(0.0)).at[..., :2].set(0.0)
 
 
 def _first_free(world: GridWorld, q_from: jax.Array, q: jax.Array, num_checks: int) -> jax.Array:

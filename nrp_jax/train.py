@@ -153,7 +153,7 @@ def train(
 
 def init(config: ModelConfig, module: nn.Module, batch: Batch, key: jax.Array) -> dict[str, Any]:
     """Random variables of a module."""
-    last = batch.clearance if config.kind == "discriminator" else key
+    last = batch.relation if config.kind == "discriminator" else key
     return module.init(key, batch.image, batch.start, batch.goal, batch.waypoints, last)
 
 
@@ -166,7 +166,7 @@ def loss_fn(
     train: bool = False,
 ):
     """The loss () of a batch; with it logits or reconstructions, and changed batch statistics."""
-    last = batch.clearance if config.kind == "discriminator" else key
+    last = batch.relation if config.kind == "discriminator" else key
     inputs = (batch.image, batch.start, batch.goal, batch.waypoints, last)
     outputs, changed = module.apply(variables, *inputs, train=train, mutable=["batch_stats"])
     if config.kind == "discriminator":

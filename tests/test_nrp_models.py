@@ -10,7 +10,7 @@ from nrp_synthetic import random_grid
 
 from nrp_jax import context, features, models
 from nrp_jax.checkpoint import Model, build_module, check_model, load_model, save_model
-from nrp_jax.examples import RESOLUTION, clearances, surrounding_map, view
+from nrp_jax.examples import RESOLUTION, relations, surrounding_map, view
 from nrp_jax.models import ModelConfig
 from nrp_jax.robots import link_features, load_robot
 from nrp_jax.world import build_world, is_free, sample_configurations
@@ -30,7 +30,8 @@ def shapes(config: ModelConfig, candidates: int = 3, lanes: int = 2):
         q, points = jnp.zeros(robot.num_joints), jnp.zeros((len(robot.feature_link), 3))
         own = features.configuration_features(config, robot, q, points)
         goal = features.goal_features(config, robot, q, points)
-        touched = features.clearance_points(robot, q, points)[:, 0]
+        ends = jnp.zeros(4)
+        touched = jnp.concatenate([features.clearance_points(robot, q, points)[:, 0], ends])
         each = jnp.zeros((lanes, candidates, 1))
         last = each * touched if config.kind == "discriminator" else jax.random.key(0)
         start = jnp.zeros((lanes, 1)) * own
@@ -114,7 +115,7 @@ def test_images_show_what_surrounds_the_start():
     robot, grid = load_robot("snake"), random_grid(1)
     world = build_world(robot, grid)
     config = ModelConfig.default("snake", "discriminator")
-    padded = surrounding_map(config, world)
+    padded = surrounding_map(config, world.field)
     q = jnp.zeros(8).at[:2].set(jnp.array([1.23, 4.77]))
     image, centre = view(config, padded, q, jnp.float32(RESOLUTION), jnp.zeros(2))
     image = np.asarray(image)
@@ -138,12 +139,15 @@ def test_clearances_are_read_where_the_robot_would_be():
     image = jnp.arange(1600.0).reshape(40, 40, 1)
     q = jnp.zeros((1, 8)).at[0, :2].set(jnp.array([0.45, -0.45]))  # straight along +y
     points = jax.vmap(lambda q: link_features(robot, q))(q)
-    read = np.asarray(clearances(robot, image, q, points))[0]
+    goal = jnp.full(8, 0.45).at[2].set(2 * np.pi - 1)  # the first joint goes round
+    read = np.asarray(relations(robot, image, jnp.zeros(8), goal, q, points))[0]
     cells = [(24, int(np.floor((-0.45 + 0.12 * k) / 0.1)) + 20) for k in range(1, 7)]
     way = [
         (20 + int(np.floor(4.5 * f)), 20 + int(np.floor(-4.5 * f))) for f in (0.25, 0.5, 0.75, 1)
     ]
-    np.testing.assert_array_equal(read, [40 * i + j for i, j in cells + way])
+    np.testing.assert_array_equal(read[:10], [40 * i + j for i, j in cells + way])
+    arm = [np.sqrt(5 * 0.45**2 + (1.0 if robot.wraps[2] else 2 * np.pi - 1) ** 2)]
+    np.testing.assert_allclose(read[10:], [np.hypot(0.45, 0.45), 0, 0.9, *arm], atol=1e-4)
 
 
 def test_candidates_are_judged_one_by_one():
