@@ -179,8 +179,13 @@ def _run(out: Path, settings: Settings, todo: list[tuple[str, int]], jobs: int):
             name = _name(split, index)
             yield name, make_shard(settings, split, index, out / name)
         return
+    import jax
+
     pool = concurrent.futures.ProcessPoolExecutor(
-        min(jobs, len(todo)), multiprocessing.get_context("spawn"), _single_thread
+        min(jobs, len(todo)),
+        multiprocessing.get_context("spawn"),
+        _start_worker,
+        (jax.config.jax_compilation_cache_dir,),
     )
     try:
         names = {}
@@ -193,8 +198,14 @@ def _run(out: Path, settings: Settings, todo: list[tuple[str, int]], jobs: int):
         pool.shutdown(cancel_futures=True)
 
 
-def _single_thread() -> None:
-    os.environ["NPROC"] = "1"  # XLA reads it when its backend starts: one thread a process
+def _start_worker(cache: str | None) -> None:
+    """One thread for each process (XLA reads NPROC when it starts), and the parent's cache."""
+    import jax
+
+    os.environ["NPROC"] = "1"
+    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
+    jax.config.update("jax_compilation_cache_dir", cache)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
 def _check(settings: Settings, homes: int, test_homes: int, jobs: int) -> None:
