@@ -161,6 +161,8 @@ def merge_cells(occupied: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
 
 def _joined(boxes: np.ndarray, column: int) -> np.ndarray:
     """Join boxes (n, 6) that differ in one extent only, where one ends and the next begins."""
+    if not len(boxes):
+        return boxes
     others = [c for c in range(6) if c not in (column, column + 1)]
     boxes = boxes[np.lexsort([boxes[:, column], *boxes[:, others].T])]
     alike = (boxes[1:, others] == boxes[:-1, others]).all(axis=1)
