@@ -56,7 +56,7 @@ def generate_house(seed: int, kind: str = "snake", clutter: float = 1.0) -> Hous
     for attempt in range(100):
         rng = np.random.default_rng([VERSION, seed, attempt, CELLS[kind]])
         house = _attempt(rng, seed, kind, clutter)
-        if len(house.rooms) >= MIN_ROOMS and is_connected(house.grid, kind):
+        if house and len(house.rooms) >= MIN_ROOMS and is_connected(house.grid, kind):
             return house
     raise RuntimeError(f"no home came out of seed {seed} in 100 attempts; take another seed")
 
@@ -73,12 +73,14 @@ def floor(grid: Grid, kind: str) -> np.ndarray:
     return ndimage.distance_transform_edt(~plan) * grid.resolution > ERODE + 0.5 * grid.resolution
 
 
-def _attempt(rng: np.random.Generator, seed: int, kind: str, clutter: float) -> House:
+def _attempt(rng: np.random.Generator, seed: int, kind: str, clutter: float) -> House | None:
     side = CELLS[kind]
     width, depth = (side, side) if kind == "snake" else rng.integers(120, side + 1, 2).tolist()
     num_rooms = int(rng.integers(4, 7) if kind == "snake" else rng.integers(5, 9))
     plan = make_floor_plan(rng, side, width, depth, num_rooms)
     draft = _Draft(plan, round(10 * BODY[kind]))
+    if ndimage.label(~draft.blocked)[1] != 1:
+        return None  # then nothing could be placed
     for door in plan.doors:
         draft.keep_clear(door)
         if max(door.x1 - door.x0, door.y1 - door.y0) <= 12 and rng.random() < 0.35:
