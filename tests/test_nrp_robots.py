@@ -118,7 +118,7 @@ def test_only_links_of_one_layer_of_the_snake_are_checked():
 def test_share_of_postures_that_hit_themselves(rng):
     """Near those of the paper's models: 48 % (its last link stands off farther) and 13.8 %."""
     grid = nrp_jax.Grid(occupied=np.zeros((100, 100, 20), bool))
-    for name, low, high in (("snake", 0.50, 0.56), ("fetch", 0.10, 0.22)):
+    for name, low, high in (("snake", 0.51, 0.58), ("fetch", 0.10, 0.22)):
         robot = nrp_jax.load_robot(name)
         world = nrp_jax.build_world(robot, grid)
         q = random_q(robot, rng, 4096)
