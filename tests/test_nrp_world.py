@@ -52,12 +52,12 @@ def distance_to_cells(grid, points):
 def test_room_is_a_close_lower_bound(worlds, rng, name):
     _, grid, _ = worlds[name]
     low, high = np.array(grid.origin), grid.origin + grid.size
-    points = rng.uniform(low - 0.2, high + [0.2, 0.2, 0.5], (4000, 3))
+    points = rng.uniform(low - 0.2, high + 0.2, (4000, 3))
     exact = distance_to_cells(grid, points)
     found = np.asarray(room(make_field(grid), jnp.asarray(points.T, jnp.float32)))
     assert np.all(found <= exact + 1e-5)
-    between = exact > 0
-    assert np.mean(exact[between] - found[between]) < (0.006 if grid.planar else 0.025)
+    between = (exact > 0) & (points[:, 2] > low[2]) & (points[:, 2] < high[2])
+    assert np.mean(exact[between] - found[between]) < (0.006 if grid.planar else 0.03)
 
 
 @pytest.mark.parametrize("name", ["snake", "fetch"])
@@ -72,8 +72,8 @@ def test_no_collision_is_missed(worlds, name):
     assert 0.03 < free.mean() < 0.9
     assert not np.any(free & ~by_loop)
     assert not np.any(free & ~by_mujoco)
-    assert np.mean(~free & by_loop) < 0.03  # false alarms
-    assert np.mean(~free & by_mujoco) < 0.06
+    assert np.mean(~free & by_loop) < (0.02 if name == "snake" else 0.05)  # false alarms
+    assert np.mean(~free & by_mujoco) < (0.04 if name == "snake" else 0.08)
 
 
 def test_outside_the_map_all_is_solid(worlds):
@@ -113,13 +113,13 @@ def test_edges_and_metric(worlds, name):
     q_a, q_b = sample_configurations(world, jax.random.key(2), 64).reshape(2, 32, -1)
     np.testing.assert_allclose(world.distance(q_a, q_b), world.distance(q_b, q_a), rtol=1e-4)
     if name == "snake":
-        step = np.asarray(q_b - q_a)
+        step = np.array(q_b - q_a)
         step[:, 2:] = (step[:, 2:] + np.pi) % (2 * np.pi) - np.pi
         base, arm = np.linalg.norm(step[:, :2], axis=1), np.linalg.norm(step[:, 2:], axis=1)
         np.testing.assert_allclose(world.distance(q_a, q_b), base + 0.167 * arm, rtol=1e-4)
     ends = [world.interpolate(q_a, q_b, f) for f in (0.0, 1.0)]
     for end, q in zip(ends, (q_a, q_b), strict=True):
-        apart = np.asarray(end - q)
+        apart = np.array(end - q)
         wraps = np.asarray(world.wraps)
         apart[:, wraps] = (apart[:, wraps] + np.pi) % (2 * np.pi) - np.pi
         assert np.abs(apart).max() < 1e-3
@@ -188,7 +188,7 @@ def test_ros_map(tmp_path):
     Image.fromarray(grey).save(tmp_path / "home.pgm")
     (tmp_path / "home.yaml").write_text(
         "image: home.pgm\nresolution: 0.05\norigin: [-1.0, -2.0, 0.0]\nnegate: 0\n"
-        "occupied_thresh: 0.65\nfree_thresh: 0.25\n"
+        "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )
     grid = load_map(tmp_path / "home.yaml")
     assert grid.occupied.shape == (31, 20, 1) and grid.origin == (-1.0, -2.0, 0.0)
