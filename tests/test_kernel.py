@@ -147,11 +147,12 @@ def test_steering_respects_limits_length_and_wrapping(panda, wall_world):
 
 
 def test_free_steps_counts_the_leading_free_ones(wall_world, free):
-    step = jnp.asarray(GOAL - START)[None]
     points = START + np.linspace(0, 1, 65)[1:, None] * (GOAL - START)
     is_free = np.asarray(free(wall_world, points.astype(np.float32)))
     assert not is_free.all() and is_free[0]
-    count = jax.jit(free_steps, static_argnums=3)(wall_world, jnp.asarray(START)[None], step, 64)
+    count = jax.jit(free_steps, static_argnums=3)(
+        wall_world, jnp.asarray(START)[None], jnp.asarray(GOAL)[None], 64
+    )
     assert int(count[0]) == int(np.argmin(is_free))
 
 

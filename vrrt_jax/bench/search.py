@@ -9,7 +9,7 @@ import numpy as np
 
 from vrrt_jax import planner
 from vrrt_jax.bench.timing import interleaved_ms
-from vrrt_jax.core.edges import free_steps
+from vrrt_jax.core.edges import free_along
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.search import make_stop, search
 from vrrt_jax.core.types import Expansion
@@ -57,7 +57,7 @@ def iteration_split(problem: Problem, repeats: int = 15) -> dict:
         "gradient": (lambda p, w, *rest: p.evaluate(w, *rest), (policy, world, parents, proposals)),
         "propose": (lambda p, *rest: p.propose(*rest), (policy, world, tree, key)),
         "edges": (
-            lambda w, a, b: free_steps(w, a, b, policy.edge_steps),
+            lambda w, a, b: free_along(w, a, b, policy.edge_steps),
             (world, parents, proposals.target - parents),
         ),
         "rewire": (

@@ -1,35 +1,164 @@
-"""Steering and edges: differences that respect wrapping joints, and collision along an edge."""
+"""Edges: how a robot goes from one configuration to another, and how far it is free to.
+
+A world says what its edges are, so that the kernel serves straight lines, turning joints and curves
+alike. An edge is a pytree of arrays that lead with the lanes; what is in it, only the world knows.
+"""
+
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 
-from vrrt_jax.core.world import World, is_free
+Edge = Any
 
 
-def difference(world: World, q_from: jax.Array, q_to: jax.Array) -> jax.Array:
+class Space(Protocol):
+    """What the kernel asks a world. Configurations are (..., D), edges lead with (...)."""
+
+    @property
+    def lower(self) -> jax.Array:
+        """(D,) limits that samples keep."""
+        ...
+
+    @property
+    def upper(self) -> jax.Array:
+        """(D,) limits that samples keep."""
+        ...
+
+    @property
+    def resolution(self) -> jax.Array:
+        """() longest sub-step between two collision checks, in the units of distances."""
+        ...
+
+    def is_free(self, q: jax.Array) -> jax.Array:
+        """Whether ``q`` (D,) touches nothing, () bool."""
+        ...
+
+    def distance(self, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
+        """Length (...) of the edge between two configurations."""
+        ...
+
+    def distances(self, nodes: jax.Array, q: jax.Array, among: jax.Array) -> jax.Array:
+        """Distances (B, N) from ``q`` (B, D) to ``nodes`` (N, D), +inf where ``among`` is False.
+
+        A world with a costly metric may also answer +inf for nodes that are far.
+        """
+        ...
+
+    def edge(self, q_from: jax.Array, q_to: jax.Array) -> Edge:
+        """The shortest edge from one configuration to another."""
+        ...
+
+    def steer(self, q_from: jax.Array, target: jax.Array, num_steps: int) -> Edge:
+        """The edge towards a target inside the limits, cut to what ``num_steps`` can check."""
+        ...
+
+    def checkable(self, edge: Edge, num_steps: int) -> jax.Array:
+        """Whether (...) ``num_steps`` sub-steps are fine enough for an edge."""
+        ...
+
+    def part(self, edge: Edge, fraction: jax.Array) -> Edge:
+        """The first fraction (...) of an edge."""
+        ...
+
+    def length(self, edge: Edge) -> jax.Array:
+        """Length (...) of an edge."""
+        ...
+
+    def end(self, q_from: jax.Array, edge: Edge) -> jax.Array:
+        """Where an edge leads to; wrapping joints may have passed pi."""
+        ...
+
+    def normalise(self, q: jax.Array) -> jax.Array:
+        """The same configuration, wrapping joints in [-pi, pi)."""
+        ...
+
+
+class Straight:
+    """Straight edges, the short way round for joints that wrap; the edge is the step (..., D).
+
+    For dataclasses with ``lower``, ``upper``, ``wraps`` (D,) and ``resolution`` ().
+    """
+
+    lower: jax.Array
+    upper: jax.Array
+    wraps: jax.Array
+    resolution: jax.Array
+
+    def distance(self, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
+        """See :class:`Space`."""
+        return self.length(self.edge(q_a, q_b))
+
+    def distances(self, nodes: jax.Array, q: jax.Array, among: jax.Array) -> jax.Array:
+        """See :class:`Space`."""
+        # Joint by joint: XLA's CPU loops for a sum over the last, short axis are many times slower.
+        squared = jnp.zeros((q.shape[0], nodes.shape[0]), q.dtype)
+        for joint in range(q.shape[1]):
+            squared += joint_steps(self, nodes, q, joint) ** 2
+        return jnp.where(among, jnp.sqrt(squared), jnp.inf)
+
+    def edge(self, q_from: jax.Array, q_to: jax.Array) -> jax.Array:
+        """See :class:`Space`."""
+        return difference(self, q_from, q_to)
+
+    def steer(self, q_from: jax.Array, target: jax.Array, num_steps: int) -> jax.Array:
+        """See :class:`Space`."""
+        return steer(self, q_from, target, num_steps * self.resolution)
+
+    def checkable(self, edge: jax.Array, num_steps: int) -> jax.Array:
+        """See :class:`Space`."""
+        return self.length(edge) <= num_steps * self.resolution
+
+    def part(self, edge: jax.Array, fraction: jax.Array) -> jax.Array:
+        """See :class:`Space`."""
+        return edge * fraction[..., None]
+
+    def length(self, edge: jax.Array) -> jax.Array:
+        """See :class:`Space`."""
+        return jnp.sqrt(jnp.sum(edge**2, axis=-1))
+
+    def end(self, q_from: jax.Array, edge: jax.Array) -> jax.Array:
+        """See :class:`Space`."""
+        return q_from + edge
+
+    def normalise(self, q: jax.Array) -> jax.Array:
+        """See :class:`Space`."""
+        return normalise(self, q)
+
+
+def joint_steps(space: Straight, nodes: jax.Array, q: jax.Array, joint: int) -> jax.Array:
+    """Steps (B, N) of one joint from ``q`` (B, D) to ``nodes`` (N, D)."""
+    step = nodes[:, joint] - q[:, joint, None]
+    turns = jnp.where(space.wraps[joint], jnp.round(step / (2 * jnp.pi)), 0.0)
+    return step - 2 * jnp.pi * turns
+
+
+def difference(world: Straight, q_from: jax.Array, q_to: jax.Array) -> jax.Array:
     """The step (..., D) from one configuration to another, the short way round."""
     step = q_to - q_from
     turns = jnp.where(world.wraps, jnp.round(step / (2 * jnp.pi)), 0.0)
     return step - 2 * jnp.pi * turns
 
 
-def distance(world: World, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
-    """Length (...) of the straight edge between configurations (..., D) [rad]."""
-    return jnp.sqrt(jnp.sum(difference(world, q_a, q_b) ** 2, axis=-1))
+def distance(world: Space, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
+    """Length (...) of the edge between configurations (..., D)."""
+    return world.distance(q_a, q_b)
 
 
-def normalise(world: World, q: jax.Array) -> jax.Array:
+def normalise(world: Straight, q: jax.Array) -> jax.Array:
     """Bring wrapping joints of (..., D) back to [-pi, pi)."""
     turns = jnp.where(world.wraps, jnp.floor((q + jnp.pi) / (2 * jnp.pi)), 0.0)
     return q - 2 * jnp.pi * turns
 
 
-def into_limits(world: World, q: jax.Array) -> jax.Array:
+def into_limits(world: Straight, q: jax.Array) -> jax.Array:
     """The nearest configurations (..., D) inside the limits."""
     return jnp.where(world.wraps, normalise(world, q), jnp.clip(q, world.lower, world.upper))
 
 
-def steer(world: World, q_from: jax.Array, target: jax.Array, max_length: jax.Array) -> jax.Array:
+def steer(
+    world: Straight, q_from: jax.Array, target: jax.Array, max_length: jax.Array
+) -> jax.Array:
     """The step (..., D) towards a target, inside the limits and no longer than ``max_length``.
 
     Limits clip each joint by itself, so that a step into a limit slides along it.
@@ -41,19 +170,30 @@ def steer(world: World, q_from: jax.Array, target: jax.Array, max_length: jax.Ar
     return step * jnp.minimum(1.0, max_length / jnp.maximum(length, 1e-12))
 
 
-def free_steps(world: World, q_from: jax.Array, step: jax.Array, num_steps: int) -> jax.Array:
+def free_steps(world: Space, q_from: jax.Array, q_to: jax.Array, num_steps: int) -> jax.Array:
+    """How far one can go from one configuration to another: see :func:`free_along`."""
+    return free_along(world, q_from, world.edge(q_from, q_to), num_steps)
+
+
+def free_along(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) -> jax.Array:
     """How far one can go along edges before something is touched.
 
     Args:
         world: what to collide with.
         q_from: (B, D) starts, taken to be free.
-        step: (B, D) edges.
+        edge: of B lanes.
         num_steps: S sub-steps along each edge, checked at their far ends.
 
     Returns:
         (B,) i32 number of leading sub-steps that are free; S where the whole edge is.
     """
-    fraction = jnp.arange(1, num_steps + 1, dtype=step.dtype) / num_steps
-    points = q_from[:, None] + fraction[:, None] * step[:, None]
-    free = jax.vmap(is_free, (None, 0))(world, points.reshape(-1, step.shape[-1]))
+    points = points_along(world, q_from, edge, num_steps)
+    free = jax.vmap(world.is_free)(points.reshape(-1, points.shape[-1]))
     return jnp.sum(jnp.cumprod(free.reshape(points.shape[:2]), axis=1), axis=1)
+
+
+def points_along(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) -> jax.Array:
+    """Configurations (B, S, D) at the far ends of S equal sub-steps of B edges."""
+    fraction = jnp.arange(1, num_steps + 1, dtype=q_from.dtype) / num_steps
+    edges = jax.tree.map(lambda leaf: leaf[:, None], edge)
+    return world.end(q_from[:, None], world.part(edges, fraction))

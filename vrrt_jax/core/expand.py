@@ -6,15 +6,14 @@ import jax
 import jax.numpy as jnp
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import free_steps, normalise, steer
+from vrrt_jax.core.edges import Space, free_along
 from vrrt_jax.core.types import Expansion, ExpansionPolicy, Payload, Rejection, Tree
-from vrrt_jax.core.world import World
 
 SHORTEST_EDGE = 1e-5  # [rad] a shorter step would only duplicate its parent
 
 
 def expand(
-    world: World, policy: ExpansionPolicy[Payload], tree: Tree[Payload], key: jax.Array
+    world: Space, policy: ExpansionPolicy[Payload], tree: Tree[Payload], key: jax.Array
 ) -> Tree[Payload]:
     """Propose, steer, check edges, filter, evaluate, insert, and let the policy follow up.
 
@@ -28,14 +27,13 @@ def expand(
     proposals = policy.propose(world, tree, jax.random.fold_in(key, tree.iteration))
     parent = jnp.where(proposals.ok, proposals.parent, 0)
     q_from = tree.q[parent]
-    max_length = policy.edge_steps * world.resolution
-    step = steer(world, q_from, proposals.target, max_length)
+    edge = world.steer(q_from, proposals.target, policy.edge_steps)
 
-    passed = free_steps(world, q_from, step, policy.edge_steps)
+    passed = free_along(world, q_from, edge, policy.edge_steps)
     free = (passed == policy.edge_steps) | (proposals.partial & (passed > 0))
-    step = step * (passed / policy.edge_steps)[:, None]
-    length = jnp.sqrt(jnp.sum(step**2, axis=-1))
-    q = normalise(world, q_from + step)
+    edge = world.part(edge, passed / policy.edge_steps)
+    length = world.length(edge)
+    q = world.normalise(world.end(q_from, edge))
 
     # A NaN target gives a NaN length: caught as not finite, before it can look like a limit.
     finite = jnp.isfinite(length)

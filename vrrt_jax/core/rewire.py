@@ -12,16 +12,15 @@ import jax
 import jax.numpy as jnp
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import difference, distance, free_steps
+from vrrt_jax.core.edges import Space, distance, free_along
 from vrrt_jax.core.types import Expansion, Tree
-from vrrt_jax.core.world import World
 
 Payload = TypeVar("Payload")
 GAIN = 1e-4  # [rad] adoptions that save less are rounding noise
 
 
 def rewire(
-    world: World,
+    world: Space,
     tree: Tree[Payload],
     expansion: Expansion,
     *,
@@ -84,7 +83,7 @@ def _largest(gain: jax.Array, num: int) -> tuple[jax.Array, jax.Array]:
     return lane, gain > GAIN
 
 
-def with_costs(world: World, tree: Tree[Payload]) -> Tree[Payload]:
+def with_costs(world: Space, tree: Tree[Payload]) -> Tree[Payload]:
     """Recompute every node's path length, by pointer doubling; roots keep the cost they have."""
     has_parent = tree.parent >= 0
     ancestor = jnp.where(has_parent, tree.parent, jnp.arange(tree.capacity))
@@ -94,5 +93,6 @@ def with_costs(world: World, tree: Tree[Payload]) -> Tree[Payload]:
     return dataclasses.replace(tree, cost=tree.cost[ancestor] + length)
 
 
-def _edge_is_free(world: World, q_from: jax.Array, q_to: jax.Array, steps: int) -> jax.Array:
-    return free_steps(world, q_from, difference(world, q_from, q_to), steps) == steps
+def _edge_is_free(world: Space, q_from: jax.Array, q_to: jax.Array, steps: int) -> jax.Array:
+    edge = world.edge(q_from, q_to)
+    return world.checkable(edge, steps) & (free_along(world, q_from, edge, steps) == steps)

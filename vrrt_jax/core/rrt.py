@@ -7,15 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import difference, distance
+from vrrt_jax.core.edges import Space, distance
 from vrrt_jax.core.rewire import rewire
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
-from vrrt_jax.core.world import World
 
 SAME = 1e-4  # [rad] configurations nearer than this are one
 
 
-def sample_configurations(world: World, key: jax.Array, num: int) -> jax.Array:
+def sample_configurations(world: Space, key: jax.Array, num: int) -> jax.Array:
     """Uniform configurations (num, D) inside the limits."""
     return jax.random.uniform(
         key, (num, world.lower.shape[0]), minval=world.lower, maxval=world.upper
@@ -37,11 +36,11 @@ class RRT:
     edge_steps: int = static(default=32)
     rewire_steps: int = static(default=96)  # longer than a step: near is far in seven dimensions
 
-    def root(self, world: World, q: jax.Array) -> tuple[jax.Array, None]:
+    def root(self, world: Space, q: jax.Array) -> tuple[jax.Array, None]:
         """Score of a root; there is no payload."""
         return distance(world, q, self.goal), None
 
-    def propose(self, world: World, tree: Tree, key: jax.Array) -> Proposals:
+    def propose(self, world: Space, tree: Tree, key: jax.Array) -> Proposals:
         """Extend the nearest nodes towards random configurations, or the goal."""
         key_q, key_bias = jax.random.split(key)
         target = sample_configurations(world, key_q, self.lanes)
@@ -57,12 +56,12 @@ class RRT:
             carry=None,
         )
 
-    def evaluate(self, world: World, q: jax.Array, proposals: Proposals):
+    def evaluate(self, world: Space, q: jax.Array, proposals: Proposals):
         """Distances (B,) to the goal."""
         return distance(world, q, self.goal), None
 
     def after_insert(
-        self, world: World, tree: Tree, proposals: Proposals, expansion: Expansion
+        self, world: Space, tree: Tree, proposals: Proposals, expansion: Expansion
     ) -> Tree:
         """Rewire, if this is RRT*."""
         if not self.star:
@@ -109,7 +108,7 @@ class RRTConnect:
         far = jnp.full(2, jnp.finfo(jnp.float32).max)
         return trees.create(jnp.stack([q_start, q_goal]), far, ends, capacity)
 
-    def propose(self, world: World, tree: Tree[ConnectNode], key: jax.Array) -> Proposals:
+    def propose(self, world: Space, tree: Tree[ConnectNode], key: jax.Array) -> Proposals:
         """Connect the newest fresh nodes; extend with all other lanes."""
         lane = jnp.arange(self.lanes)
         index = jnp.arange(tree.capacity)
@@ -121,7 +120,8 @@ class RRTConnect:
         chosen = jnp.concatenate([jnp.zeros(half, jnp.int32), chosen.astype(jnp.int32)])
 
         # Half of the samples near the two ends: where limits are far apart, few others serve.
-        ends = tree.q[0] + jnp.stack([jnp.zeros_like(tree.q[0]), difference(world, *tree.q[:2])])
+        q_start, q_goal = tree.q[:2]
+        ends = jnp.stack([q_start, world.end(q_start, world.edge(q_start, q_goal))])
         near = dataclasses.replace(
             world,
             lower=jnp.maximum(world.lower, jnp.min(ends, axis=0) - self.margin),
@@ -135,9 +135,8 @@ class RRTConnect:
         )
         aim = jnp.where(connects[:, None], tree.q[chosen], sample)
         side = jnp.where(connects, 1 - node.side[chosen], lane % 2)
-        apart = trees.distances(world, tree, aim)
-        nearest = jnp.argmin(jnp.where(node.side == side[:, None], apart, jnp.inf), axis=1)
-        nearest = nearest.astype(jnp.int32)
+        apart = trees.distances(world, tree, aim, among=node.side == side[:, None])
+        nearest = jnp.argmin(apart, axis=1).astype(jnp.int32)
         return Proposals(
             parent=jnp.where(connects, chosen, nearest),
             target=jnp.where(connects[:, None], tree.q[nearest], aim),
@@ -151,7 +150,7 @@ class RRTConnect:
             ),
         )
 
-    def evaluate(self, world: World, q: jax.Array, proposals: Proposals):
+    def evaluate(self, world: Space, q: jax.Array, proposals: Proposals):
         """0 for children that arrived; the way left, or a large number, for the others."""
         connects, nearest, target, side = proposals.carry
         left = distance(world, q, target)
@@ -166,7 +165,7 @@ class RRTConnect:
 
     def after_insert(
         self,
-        world: World,
+        world: Space,
         tree: Tree[ConnectNode],
         proposals: Proposals,
         expansion: Expansion,

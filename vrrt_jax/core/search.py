@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.edges import Space
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.types import ExpansionPolicy, Tree, pytree
-from vrrt_jax.core.world import World
 
 CHUNK = 8  # iterations between two looks at the clock
 
@@ -108,7 +108,7 @@ def why_stopped(state: SearchState, stop: Stop) -> jax.Array:
 
 
 def run_chunk(
-    world: World,
+    world: Space,
     policy: ExpansionPolicy,
     state: SearchState,
     stop: Stop,
@@ -141,7 +141,7 @@ _chunks = jax.jit(jax.vmap(run_chunk, in_axes=(None, 0, 0, 0, 0, None)))
 
 
 def search(
-    world: World,
+    world: Space,
     policy: ExpansionPolicy,
     tree: Tree,
     *,

@@ -4,9 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.edges import difference, distance, free_steps, normalise
+from vrrt_jax.core.edges import Edge, Space, distance, free_along
 from vrrt_jax.core.types import pytree
-from vrrt_jax.core.world import World
 
 LANES = 32
 COARSE_STEPS = 16  # a first look at every candidate
@@ -24,7 +23,7 @@ class _Path:
 
 
 def shortcut(
-    world: World, path: np.ndarray, *, key: jax.Array, rounds: int = 150, patience: int = 20
+    world: Space, path: np.ndarray, *, key: jax.Array, rounds: int = 150, patience: int = 20
 ) -> np.ndarray:
     """Shorten a collision-free path; the ends stay.
 
@@ -51,7 +50,7 @@ def shortcut(
 
 
 @jax.jit
-def _shortcut(world: World, q, size, key, rounds, patience) -> _Path:
+def _shortcut(world: Space, q, size, key, rounds, patience) -> _Path:
     state = _Path(q=q, size=size, idle=jnp.int32(0), round=jnp.int32(0))
     return jax.lax.while_loop(
         lambda s: (s.round < rounds) & (s.idle < patience) & (s.size > 2),
@@ -60,26 +59,26 @@ def _shortcut(world: World, q, size, key, rounds, patience) -> _Path:
     )
 
 
-def _round(world: World, path: _Path, key: jax.Array) -> _Path:
+def _round(world: Space, path: _Path, key: jax.Array) -> _Path:
     """Try 32 candidates, splice in the free one that saves most."""
-    step = difference(world, path.q[:-1], path.q[1:])
-    length = jnp.sqrt(jnp.sum(step**2, axis=-1))  # zero beyond the end
+    edges = world.edge(path.q[:-1], path.q[1:])
+    length = world.length(edges)  # zero beyond the end
     along = jnp.concatenate([jnp.zeros(1), jnp.cumsum(length)])
 
     ends = along[-1] * jax.random.uniform(key, (LANES, 2))
     ends = jnp.sort(ends.at[0].set(jnp.stack([0.0 * along[-1], along[-1]])), axis=1)
     index = jnp.clip(jnp.searchsorted(along, ends, side="right") - 1, 0, path.size - 2)
     share = jnp.clip((ends - along[index]) / jnp.maximum(length[index], 1e-9), 0.0, 1.0)
-    q_ends = path.q[index] + share[..., None] * step[index]
+    q_ends = world.end(path.q[index], world.part(_rows(edges, index), share))
     q_a, q_b = q_ends[:, 0], q_ends[:, 1]
 
-    straight = distance(world, q_a, q_b)
-    saving = ends[:, 1] - ends[:, 0] - straight
-    tried = (saving > GAIN) & (straight <= EDGE_STEPS * world.resolution)
-    edge = jnp.where(tried[:, None], difference(world, q_a, q_b), 0.0)
-    coarse = free_steps(world, q_a, edge, COARSE_STEPS) == COARSE_STEPS
+    direct = world.edge(q_a, q_b)
+    saving = ends[:, 1] - ends[:, 0] - world.length(direct)
+    tried = (saving > GAIN) & world.checkable(direct, EDGE_STEPS)
+    direct = world.part(direct, tried.astype(q_a.dtype))
+    coarse = free_along(world, q_a, direct, COARSE_STEPS) == COARSE_STEPS
     saving, lane = jax.lax.top_k(jnp.where(tried & coarse, saving, 0.0), CHECKED)
-    free = free_steps(world, q_a[lane], edge[lane], EDGE_STEPS) == EDGE_STEPS
+    free = free_along(world, q_a[lane], _rows(direct, lane), EDGE_STEPS) == EDGE_STEPS
     saving = jnp.where(free, saving, 0.0)
 
     most = jnp.argmax(saving)
@@ -90,8 +89,8 @@ def _round(world: World, path: _Path, key: jax.Array) -> _Path:
     place = jnp.arange(path.q.shape[0])
     source = jnp.where(place <= first, place, place - (first + 3) + last + 1)
     spliced = path.q[jnp.clip(source, 0, path.q.shape[0] - 1)]
-    spliced = jnp.where((place == first + 1)[:, None], normalise(world, q_a[best]), spliced)
-    spliced = jnp.where((place == first + 2)[:, None], normalise(world, q_b[best]), spliced)
+    spliced = jnp.where((place == first + 1)[:, None], world.normalise(q_a[best]), spliced)
+    spliced = jnp.where((place == first + 2)[:, None], world.normalise(q_b[best]), spliced)
     return _Path(
         q=jnp.where(found, spliced, path.q),
         size=jnp.where(found, size, path.size),
@@ -100,7 +99,11 @@ def _round(world: World, path: _Path, key: jax.Array) -> _Path:
     )
 
 
-def path_length(world: World, path: np.ndarray) -> float:
+def _rows(edge: Edge, index: jax.Array) -> Edge:
+    return jax.tree.map(lambda leaf: leaf[index], edge)
+
+
+def path_length(world: Space, path: np.ndarray) -> float:
     """Length of a path (P, D) [rad]."""
     q = jnp.asarray(path)
     return float(jnp.sum(distance(world, q[:-1], q[1:])))

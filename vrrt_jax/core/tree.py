@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.edges import Space
 from vrrt_jax.core.types import Rejection, Tree
-from vrrt_jax.core.world import World
 
 Payload = TypeVar("Payload")
 
@@ -97,15 +97,13 @@ def occupied(tree: Tree) -> jax.Array:
     return jnp.arange(tree.capacity) < tree.size
 
 
-def distances(world: World, tree: Tree, q: jax.Array) -> jax.Array:
-    """Distances (B, N) from configurations (B, D) to every node, +inf to empty slots [rad]."""
-    # Joint by joint: XLA's CPU loops for a sum over the last, short axis are many times slower.
-    squared = jnp.zeros((q.shape[0], tree.capacity), q.dtype)
-    for joint in range(q.shape[1]):
-        step = tree.q[:, joint] - q[:, joint, None]
-        turns = jnp.where(world.wraps[joint], jnp.round(step / (2 * jnp.pi)), 0.0)
-        squared += (step - 2 * jnp.pi * turns) ** 2
-    return jnp.where(occupied(tree), jnp.sqrt(squared), jnp.inf)
+def distances(world: Space, tree: Tree, q: jax.Array, among: jax.Array | bool = True) -> jax.Array:
+    """Distances (B, N) from configurations (B, D) to nodes.
+
+    They are +inf to empty slots, to nodes that ``among`` (B, N) leaves out, and to those that a
+    world with a costly metric rules out from afar.
+    """
+    return world.distances(tree.q, q, occupied(tree) & among)
 
 
 def lineage(tree: Tree, index: int) -> np.ndarray:

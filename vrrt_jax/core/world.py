@@ -14,13 +14,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from vrrt_jax.core.edges import Straight
 from vrrt_jax.core.kinematics import Chain, link_poses, place, placement
 from vrrt_jax.core.obstacles import HALF_SPACE, Obstacles, floats, signed_distances, to_slots
 from vrrt_jax.core.types import Labels, Obstacle, Spheres, pytree, static
 
 
 @pytree
-class World:
+class World(Straight):
     """All that planners ask about robot and obstacles."""
 
     chain: Chain
@@ -38,6 +39,10 @@ class World:
     obstacle_names: Labels = static()  # (K,) '' in empty slots
     kinds: Labels = static()  # (K,)
     colours: Labels = static()  # (K,)
+
+    def is_free(self, q: jax.Array) -> jax.Array:
+        """See :func:`is_free`."""
+        return is_free(self, q)
 
 
 def sphere_centres(spheres: Spheres, poses: jax.Array) -> jax.Array:

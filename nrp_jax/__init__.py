@@ -1,0 +1,18 @@
+"""Neural randomized planning in JAX: learned samplers for long-horizon motion in homes."""
+
+from nrp_jax.grid import Grid, load_map
+from nrp_jax.robots import MobileRobot, link_features, load_robot
+from nrp_jax.world import GridWorld, batch_is_free, build_world, is_free, with_grid
+
+__all__ = [
+    "Grid",
+    "GridWorld",
+    "MobileRobot",
+    "batch_is_free",
+    "build_world",
+    "is_free",
+    "link_features",
+    "load_map",
+    "load_robot",
+    "with_grid",
+]

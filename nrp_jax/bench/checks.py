@@ -1,0 +1,207 @@
+"""How fast configurations are checked, and how right: against C MuJoCo and plain loops.
+
+Three opinions on the same random configurations: the batched check; a loop in numpy over the same
+spheres with exact distances to cells; and C MuJoCo with the robot's primitives and boxes. A
+collision that either exact one sees and the batched check does not is a missed one.
+"""
+
+import argparse
+import json
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from nrp_jax.exact import ExactScene
+from nrp_jax.grid import Grid, load_map
+from nrp_jax.robots import MobileRobot, load_robot
+from nrp_jax.world import batch_is_free, build_world, sample_configurations
+from vrrt_jax.core.kinematics import batch_link_poses
+
+BATCH = 1024
+
+
+class SphereLoop:
+    """One configuration at a time in numpy: the spheres' distances to all cells near them."""
+
+    def __init__(self, robot: MobileRobot, grid: Grid):
+        """Keep the map with a solid rim, and the spheres."""
+        self.robot = robot
+        self.grid = grid.flatten() if robot.planar else grid
+        rim = 5
+        self.solid = np.pad(
+            self.grid.occupied, [(rim, rim), (rim, rim), (0, 0)], constant_values=True
+        )
+        self.corner = np.array(self.grid.origin) - rim * self.grid.resolution * np.array([1, 1, 0])
+        self.link = np.asarray(robot.cover.link)
+        self.centre = np.asarray(robot.cover.centre, float)
+        self.radius = np.asarray(robot.cover.radius, float)
+        self.pairs = np.asarray(robot.pairs)
+        self.chain = [
+            np.asarray(getattr(robot.chain, name), float)
+            for name in ("constant", "cosine", "sine", "slide")
+        ]
+        self.falls = ~np.isin(self.link, np.arange(robot.base_dim + 2)) & (not robot.planar)
+
+    def is_free(self, q: np.ndarray) -> bool:
+        """Whether ``q`` (D,) is free."""
+        pose = self.poses(q)
+        turned = pose[self.link]
+        centre = np.einsum("nij,nj->ni", turned[:, :3, :3], self.centre) + turned[:, :3, 3]
+        first, second = self.pairs.T
+        apart = np.linalg.norm(centre[first] - centre[second], axis=1)
+        if (apart < self.radius[first] + self.radius[second]).any():
+            return False
+        if robot_plates_overlap(self.robot, pose):
+            return False
+        if (centre[self.falls, 2] <= self.radius[self.falls]).any():
+            return False
+        if any(self._hits(c, r) for c, r in zip(centre, self.radius, strict=True)):
+            return False
+        base = self.robot.footprint
+        return base is None or self._base_is_free(pose[base.link, :3, 3], centre)
+
+    def poses(self, q: np.ndarray) -> np.ndarray:
+        """Link poses (L, 4, 4)."""
+        constant, cosine, sine, slide = self.chain
+        poses = [np.eye(4)]
+        for j, parent in enumerate(self.robot.chain.parents):
+            local = (
+                constant[j] + np.cos(q[j]) * cosine[j] + np.sin(q[j]) * sine[j] + q[j] * slide[j]
+            )
+            poses.append(poses[parent] @ local)
+        return np.array(poses)
+
+    def _hits(self, centre: np.ndarray, radius: float, top: float | None = None) -> bool:
+        """Whether a sphere, or an upright cylinder up to ``top``, touches a solid cell."""
+        flat = self.robot.planar or top is not None
+        size, reach = self.grid.resolution, np.full(3, radius)
+        place = (centre - self.corner) / size
+        low = np.floor(place - reach / size).astype(int)
+        high = np.floor(place + reach / size).astype(int) + 1
+        if flat:
+            low[2], high[2] = 0, 1 if top is None else int(np.ceil(top / size - 1e-6))
+        low, high = np.maximum(low, 0), np.minimum(high, self.solid.shape)
+        cells = np.argwhere(self.solid[tuple(map(slice, low, high))]) + low
+        gap = np.maximum(np.maximum(cells - place, place - cells - 1), 0) * size
+        return bool(((gap[:, : 2 if flat else 3] ** 2).sum(1) < radius**2).any())
+
+    def _base_is_free(self, position: np.ndarray, centre: np.ndarray) -> bool:
+        base = self.robot.footprint
+        assert base is not None
+        radius, height = float(base.radius), float(base.height)
+        beside = np.linalg.norm(centre[:, :2] - position[:2], axis=1) - radius
+        gap = np.hypot(np.maximum(beside, 0), np.maximum(centre[:, 2] - height, 0))
+        if (gap[self.falls] < self.radius[self.falls]).any():
+            return False
+        return not self._hits(position, radius, top=height)
+
+
+def robot_plates_overlap(robot: MobileRobot, poses: np.ndarray) -> bool:
+    """Whether checked plates overlap: no side of either has all corners of the other beyond it."""
+    if robot.plates is None:
+        return False
+    corners = []
+    for link, centre, half in zip(
+        robot.plates.link,
+        *(np.asarray(a) for a in (robot.plates.centre, robot.plates.half)),
+        strict=True,
+    ):
+        local = centre + half * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
+        corners.append(local @ poses[link, :2, :2].T + poses[link, :2, 3])
+    for i, j in robot.plates.pairs:
+        both = (corners[i], corners[j])
+        normals = [turned for c in both for turned in np.diff(c[:3], axis=0)]
+        if all(
+            (both[0] @ n).max() >= (both[1] @ n).min()
+            and (both[1] @ n).max() >= (both[0] @ n).min()
+            for n in normals
+        ):
+            return True
+    return False
+
+
+def run(robot: MobileRobot, grid: Grid, num: int = 10_000, timed: int = 500) -> dict:
+    """Rates [1/s], and how the three opinions compare on random configurations of a map."""
+    world = build_world(robot, grid)
+    q = np.asarray(sample_configurations(world, jax.random.key(0), num))
+    batched = np.concatenate([np.asarray(batch_is_free(world, b)) for b in _batches(q)])
+    loop, scene = SphereLoop(robot, grid), ExactScene(robot, grid)
+    by_loop = np.array([loop.is_free(row) for row in q])
+    by_mujoco = np.array([scene.touching(row) is None for row in q])
+    rates = {
+        "batched": BATCH / _seconds(lambda: batch_is_free(world, q[:BATCH]).block_until_ready()),
+        "sphere_loop": timed / _seconds(lambda: [loop.is_free(row) for row in q[:timed]], 3),
+        "mujoco": timed / _seconds(lambda: [scene.touching(row) for row in q[:timed]], 3),
+    }
+    return {
+        "robot": robot.name,
+        "configurations": num,
+        "free_share": {
+            "batched": float(batched.mean()),
+            "sphere_loop": float(by_loop.mean()),
+            "mujoco": float(by_mujoco.mean()),
+        },
+        "missed": {
+            "sphere_loop": int((batched & ~by_loop).sum()),
+            "mujoco": int((batched & ~by_mujoco).sum()),
+        },
+        "false_alarm_share_of_free": {
+            "sphere_loop": float((~batched & by_loop).sum() / max(by_loop.sum(), 1)),
+            "mujoco": float((~batched & by_mujoco).sum() / max(by_mujoco.sum(), 1)),
+        },
+        "checks_per_s": {k: round(v) for k, v in rates.items()},
+        "batched_over_loop": round(rates["batched"] / rates["sphere_loop"], 1),
+        "batched_over_mujoco": round(rates["batched"] / rates["mujoco"], 1),
+        "links_us": _links_us(robot, q[:BATCH]),
+    }
+
+
+def add_arguments(subparsers) -> None:
+    """Add ``checks`` to the bench command."""
+    parser = subparsers.add_parser("checks", help="configuration checks: rate and errors")
+    parser.set_defaults(run=_run_command)
+    parser.add_argument("--map", help="a map; a random home by default")
+    parser.add_argument("--num", type=int, default=10_000, help="configurations compared")
+    parser.add_argument("--json", help="write the figures here")
+
+
+def _run_command(arguments: argparse.Namespace) -> int:
+    from nrp_jax.houses import generate_house
+
+    results = {}
+    for name in ("snake", "fetch"):
+        robot = load_robot(name)
+        grid = load_map(arguments.map) if arguments.map else generate_house(0, name).grid
+        if grid.planar and not robot.planar:
+            continue
+        results[name] = run(robot, grid, arguments.num)
+        print(json.dumps(results[name], indent=1))
+    results["machine"] = {"platform": platform.platform(), "device": str(jax.devices()[0])}
+    if arguments.json:
+        Path(arguments.json).write_text(json.dumps(results, indent=1) + "\n")
+    return 0
+
+
+def _batches(q: np.ndarray) -> list[np.ndarray]:
+    return [q[i : i + BATCH] for i in range(0, len(q), BATCH)]
+
+
+def _seconds(function: Callable, repeats: int = 20) -> float:
+    """The fastest of some runs, after one more [s]."""
+    function()
+    times = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - started)
+    return min(times)
+
+
+def _links_us(robot: MobileRobot, q: np.ndarray) -> float:
+    """Microseconds a configuration that the kinematics alone take."""
+    seconds = _seconds(lambda: batch_link_poses(robot.chain, q).block_until_ready())
+    return round(1e6 * seconds / len(q), 2)

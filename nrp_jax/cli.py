@@ -1,0 +1,141 @@
+"""The ``nrp`` command: homes, data, train, score, plan, bench."""
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+EXIT_SOLVED, EXIT_UNSOLVED, EXIT_BAD_INPUT = 0, 1, 2
+_KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae"}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code: 0 solved or done, 1 not solved, 2 bad input."""
+    arguments = _parser().parse_args(argv)
+    _use_compilation_cache()
+    try:
+        return arguments.run(arguments)
+    except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
+        print(f"nrp {arguments.command}: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+
+
+def _parser() -> argparse.ArgumentParser:
+    from nrp_jax import data, houses, score, train
+    from nrp_jax.bench import checks
+
+    parser = argparse.ArgumentParser(
+        prog="nrp", description="Motion planning in homes, with learned samplers."
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    for module in (houses, data, train, score):
+        module.add_arguments(commands)
+    _add_plan(commands)
+    bench = commands.add_parser("bench", help="measure speed")
+    checks.add_arguments(bench.add_subparsers(dest="what", required=True))
+    return parser
+
+
+def _add_plan(commands) -> None:
+    plan = commands.add_parser("plan", help="plan between two configurations in a home")
+    plan.set_defaults(run=_plan)
+    plan.add_argument("--map", required=True, help=".npz, ROS .yaml or MJCF .xml")
+    plan.add_argument("--robot", default="snake", help="snake or fetch")
+    plan.add_argument("--start", type=_numbers, required=True, help="configuration, as 1,2.5,0,...")
+    plan.add_argument("--goal", type=_numbers, required=True, help="configuration")
+    plan.add_argument("--method", default="rrt-connect", help="rrt, rrt-is, nrp-d, ...")
+    plan.add_argument("--model", help="what nrp train wrote; packaged weights by default")
+    plan.add_argument("--crop", type=_numbers, help="plan in x0,y0,x1,y1 of the map [m]")
+    plan.add_argument("--resolution", type=float, help="of collision checks [m] and [rad]")
+    plan.add_argument("--max-expansions", type=int, default=32_000)
+    plan.add_argument("--capacity", type=int, default=8192, help="nodes of the tree")
+    plan.add_argument("--time-limit", type=float, default=60.0, help="of the search [s]")
+    plan.add_argument("--seed", type=int, default=0)
+    plan.add_argument("--out", default="out", help="folder for path.json and plan.png")
+    plan.add_argument("--no-pictures", action="store_true")
+
+
+def _plan(arguments: argparse.Namespace) -> int:
+    import jax
+
+    from nrp_jax.grid import load_map
+    from nrp_jax.planner import plan
+    from nrp_jax.robots import load_robot
+    from nrp_jax.world import build_world
+
+    robot, grid = load_robot(arguments.robot), load_map(arguments.map)
+    if arguments.crop is not None:
+        if len(arguments.crop) != 4:
+            raise ValueError(f"--crop has {len(arguments.crop)} numbers; expected x0,y0,x1,y1")
+        grid = grid.crop(arguments.crop[:2], arguments.crop[2:])
+    sampler = None
+    if arguments.method in _KINDS:
+        from nrp_jax.samplers import load_sampler
+
+        sampler = load_sampler(robot.name, _KINDS[arguments.method], arguments.model)
+    world = build_world(robot, grid, resolution=arguments.resolution)
+    result = plan(
+        robot,
+        grid,
+        arguments.start,
+        arguments.goal,
+        key=jax.random.key(arguments.seed),
+        method=arguments.method,
+        sampler=sampler,
+        world=world,
+        max_expansions=arguments.max_expansions,
+        capacity=arguments.capacity,
+        time_limit_s=arguments.time_limit,
+    )
+    out = Path(arguments.out)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "path.json").write_text(json.dumps(_record(robot.name, arguments, result), indent=1))
+    if not arguments.no_pictures:
+        from nrp_jax.viz import save_plan
+
+        save_plan(out / "plan.png", robot, grid, world, result, arguments.goal)
+    print(result)
+    if not result.ok:
+        problem = result.verification.problem if result.verification else None
+        print(f"{result.status.value}{f' ({problem})' if problem else ''}", file=sys.stderr)
+    return EXIT_SOLVED if result.ok else EXIT_UNSOLVED
+
+
+def _record(robot: str, arguments: argparse.Namespace, result) -> dict:
+    """What ``path.json`` holds."""
+    return {
+        "robot": robot,
+        "map": str(arguments.map),
+        "method": arguments.method,
+        "seed": arguments.seed,
+        "status": result.status.name,
+        "verified": bool(result.verification and result.verification.ok),
+        "cost": round(result.cost, 4),
+        "expansions": result.expansions,
+        "nodes": int(result.tree.size),
+        "timing": {k: round(v, 4) for k, v in result.timing.items()},
+        "path": [[round(float(v), 5) for v in q] for q in result.path],
+        "trajectory": [[round(float(v), 5) for v in q] for q in result.trajectory],
+    }
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is not a list of numbers such as 1,2.5,0"
+        ) from None
+
+
+def _use_compilation_cache() -> None:
+    """Keep compiled programs between runs, unless the user has said where or not at all."""
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", str(home / "nrp_jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)

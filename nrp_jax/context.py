@@ -1,0 +1,54 @@
+"""Local windows: what the networks see of a map around the base of the robot.
+
+A window is 4 x 4 m (x 2 m), aligned with the map, centred on the corner of cells nearest to the
+base: cell (i, j) of it covers [0.1 (i - 20), 0.1 (i - 19)) from there. Outside the map everything
+is occupied.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+SIDE = 40  # cells
+
+
+def pad(occupied: np.ndarray) -> jax.Array:
+    """A map (X, Y, Z) with a border of occupied cells, for :func:`window`; do this once a map."""
+    border = ((SIDE // 2,) * 2, (SIDE // 2,) * 2, (0, 0))
+    return jnp.asarray(np.pad(occupied, border, constant_values=True))
+
+
+def centre_cell(q: jax.Array, resolution=0.1, origin=(0.0, 0.0)) -> jax.Array:
+    """Corner of cells (..., 2) i32 nearest to the base at ``q`` (..., D), from the map's origin."""
+    place = q[..., :2] - jnp.asarray(origin, q.dtype)[..., :2]
+    return jnp.round(place / resolution).astype(jnp.int32)
+
+
+def centre(q: jax.Array, resolution=0.1, origin=(0.0, 0.0)) -> jax.Array:
+    """Place (..., 2) [m] of the window's centre in the map: the origin of the local frame."""
+    cell = centre_cell(q, resolution, origin)
+    return cell * resolution + jnp.asarray(origin, q.dtype)[..., :2]
+
+
+def window(padded: jax.Array, q: jax.Array, resolution=0.1, origin=(0.0, 0.0)) -> jax.Array:
+    """The window (40, 40, Z) around ``q`` (D,); vmappable.
+
+    Args:
+        padded: from :func:`pad`, (X + 40, Y + 40, Z).
+        q: (D,) configuration whose base, its first two joints, is in the map [m].
+        resolution: side of a cell [m].
+        origin: place of the corner of the map's first cell [m].
+    """
+    corner = centre_cell(q, resolution, origin)  # the border shifts it by half a window, and back
+    size = (SIDE, SIDE, padded.shape[2])
+    return jax.lax.dynamic_slice(padded, (corner[0], corner[1], 0), size)
+
+
+windows = jax.jit(jax.vmap(window, (None, 0, None, None)))  # of q (n, D): (n, 40, 40, Z)
+
+
+def stacked_window(padded: jax.Array, index: jax.Array, q: jax.Array, resolution=0.1) -> jax.Array:
+    """The window (40, 40, Z) around ``q`` in map ``index`` of several (H, X + 40, Y + 40, Z)."""
+    corner = centre_cell(q, resolution)
+    size = (1, SIDE, SIDE, padded.shape[3])
+    return jax.lax.dynamic_slice(padded, (index, corner[0], corner[1], 0), size)[0]

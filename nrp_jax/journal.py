@@ -1,0 +1,119 @@
+"""What training leaves behind: checkpoints to go on from, a log, and curves."""
+
+import csv
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import optax
+import orbax.checkpoint as ocp
+
+from vrrt_jax.core.types import pytree
+
+SECONDS_BETWEEN = 10.0  # checkpoints
+
+
+@pytree
+class State:
+    """What changes as training goes on."""
+
+    variables: Any
+    optimiser: optax.OptState
+    step: jax.Array  # ()
+
+
+class Keeper:
+    """A recent epoch on disk, by orbax: a folder appears whole or not at all."""
+
+    def __init__(self, folder: Path):
+        """Look into a folder, or make it."""
+        options = ocp.CheckpointManagerOptions(max_to_keep=1)
+        self._manager = ocp.CheckpointManager(folder.resolve(), options=options)
+        self._saved = 0.0
+
+    def restore(self, state: State) -> tuple[State, Any, list[dict[str, float]]]:
+        """The state, best variables and history of the last epoch; as given if there is none."""
+        best = jax.device_get(state.variables)
+        epoch = self._manager.latest_step()
+        if epoch is None:
+            return state, best, []
+        leaves = ocp.args.StandardRestore({"state": _plain(state), "best": best})
+        arguments = ocp.args.Composite(arrays=leaves, history=ocp.args.JsonRestore())
+        saved = self._manager.restore(epoch, args=arguments)
+        leaves = jax.tree.leaves(saved.arrays["state"])
+        state = jax.tree.unflatten(jax.tree.structure(state), leaves)
+        return state, saved.arrays["best"], saved.history
+
+    def save(self, state: State, best: Any, history: list[dict[str, float]], last: bool) -> None:
+        """Write an epoch, then drop the one before; not too often, unless it is the last."""
+        if not last and time.monotonic() - self._saved < SECONDS_BETWEEN:
+            return
+        self._saved = time.monotonic()
+        arrays = ocp.args.StandardSave({"state": _plain(state), "best": best})
+        arguments = ocp.args.Composite(arrays=arrays, history=ocp.args.JsonSave(history))
+        self._manager.save(len(history), args=arguments)
+        self._manager.wait_until_finished()
+
+    def close(self) -> None:
+        """Let go of the folder."""
+        self._manager.close()
+
+
+def _plain(state: State) -> list[jax.Array]:
+    return jax.tree.leaves(state)
+
+
+def waited(history: list[dict[str, float]]) -> int:
+    """Epochs since the best one."""
+    if not history:
+        return 0
+    return len(history) - 1 - int(np.argmin([row["loss"] for row in history]))
+
+
+def claim(out: Path, parts: dict[str, Any]) -> Path:
+    """Make a folder ours, or see that it was already.
+
+    Raises:
+        ValueError: it holds a training of something else.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(parts, indent=1)
+    file = out / "training.json"
+    if file.exists() and file.read_text() != text:
+        raise ValueError(
+            f"'{out}' holds a training of another model, data set or settings; choose another "
+            "folder with --out, or delete it"
+        )
+    part = file.with_suffix(".part")
+    part.write_text(text)
+    part.replace(file)
+    return out
+
+
+def write_log(history: list[dict[str, float]], out: Path) -> None:
+    """Write ``log.csv``."""
+    part = out / "log.part"
+    with open(part, "w", newline="") as handle:
+        writer = csv.DictWriter(handle, list(history[0]))
+        writer.writeheader()
+        writer.writerows(history)
+    part.replace(out / "log.csv")
+
+
+def plot_curves(history: list[dict[str, float]], path: Path, title: str) -> None:
+    """Draw training and validation loss, and quality, over the epochs."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    epochs = [row["epoch"] for row in history]
+    left.plot(epochs, [row["train_loss"] for row in history], label="training homes")
+    left.plot(epochs, [row["loss"] for row in history], label="held-out homes")
+    left.set(xlabel="epoch", ylabel="loss", title=title)
+    left.legend()
+    right.plot(epochs, [row["quality"] for row in history])
+    right.set(xlabel="epoch", ylabel="quality on held-out homes")
+    figure.savefig(path, dpi=120)

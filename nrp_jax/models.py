@@ -1,0 +1,287 @@
+"""The learned models: a discriminator that ranks waypoints, a CVAE that generates them.
+
+Both see the surroundings of the start as an image, encoded once and shared by all candidates
+(Lu et al. 2024, section IV). Letters: ``n`` starts, ``C`` candidates each, ``E`` features.
+"""
+
+import dataclasses
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+KINDS = ("discriminator", "cvae")
+TASKS = ("snake", "fetch")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ModelConfig:
+    """Architecture and input of a model; part of its checkpoint."""
+
+    task: str  # snake or fetch
+    kind: str  # discriminator or cvae
+    scope: str = "window"  # what is seen: the local window, or the whole map
+    paper: bool = False  # the published architecture and its raw inputs
+    patches: tuple[int, ...] = (4, 2)  # side of the patches each encoder layer merges
+    channels: tuple[int, ...] = (32, 64)  # width of each encoder layer
+    context: int = 128  # width of the layers that join image, start and goal
+    width: int = 64  # width of the layers behind, for each candidate or latent
+    lookup: bool = True  # tell what the image holds where each candidate would be; windows only
+    latent: int = 8  # dimensions of the CVAE's latent
+    kl_weight: float = 0.01  # of the CVAE's KL term
+
+    @classmethod
+    def default(cls, task: str, kind: str, scope: str = "window") -> "ModelConfig":
+        """The light architecture: patches joined by matrix products, height as channels."""
+        check_choices(task, kind, scope)
+        wide = {"channels": (64, 96), "context": 192} if task == "fetch" else {}
+        if scope == "map":
+            wide["lookup"] = False
+            wide["patches"] = (5, 2, 2) if task == "snake" else (5, 2, 3)
+            wide["channels"] = (32, 64, 96)
+        if kind == "cvae":
+            wide |= {"context": 384, "width": 384}
+        return cls(task=task, kind=kind, scope=scope, **wide)
+
+    @classmethod
+    def published(cls, task: str, kind: str, scope: str = "window") -> "ModelConfig":
+        """The paper's architecture, as its code has it."""
+        check_choices(task, kind, scope)
+        width = 512 if task == "snake" else 1024
+        latent = 5 if task == "snake" else 8
+        return cls(
+            task=task, kind=kind, scope=scope, paper=True, lookup=False, width=width, latent=latent
+        )
+
+
+def check_choices(task: str, kind: str, scope: str = "window") -> None:
+    """Raise a ValueError that lists what there is."""
+    for name, value, choices in (
+        ("task", task, TASKS),
+        ("model", kind, KINDS),
+        ("scope", scope, ("window", "map")),
+    ):
+        if value not in choices:
+            raise ValueError(f"unknown {name} '{value}'; have: {', '.join(choices)}")
+
+
+# Features, kernel, stride, padding, normalised, pooled: the convolutions of the published models.
+_SNAKE = (
+    (16, (4, 4), 2, 1, False, False),
+    (32, (3, 3), 2, 1, True, False),
+    (64, (3, 3), 2, 1, True, False),
+)
+_CONVOLUTIONS = {
+    ("snake", "window", "discriminator"): _SNAKE,
+    ("snake", "window", "cvae"): (*_SNAKE, (128, (4, 4), 2, 1, True, False)),
+    ("snake", "map"): (*_SNAKE, (128, (4, 4), 2, 1, True, False)),
+    ("fetch", "window"): (
+        (64, (3, 3, 3), 1, 0, True, True),
+        (64, (3, 3, 3), 1, 0, True, True),
+        (64, (3, 3, 3), 1, 0, True, False),
+    ),
+    ("fetch", "map"): (
+        (16, (7, 7, 3), 2, 0, True, False),
+        (32, (5, 5, 3), 1, 0, True, True),
+        (64, (5, 5, 3), 1, 0, True, False),
+        (128, (5, 5, 1), 1, 0, True, False),
+    ),
+}
+
+
+class PatchEncoder(nn.Module):
+    """Merges patches layer by layer; matrix products are far faster on a CPU than convolutions."""
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(self, image: jax.Array, train: bool) -> jax.Array:
+        """Features (n, F) of images (n, X, Y, Z), whose heights are channels."""
+        x = image
+        for side, channels in zip(self.config.patches, self.config.channels, strict=True):
+            n, width, depth, _ = x.shape
+            x = x.reshape(n, width // side, side, depth // side, side, -1)
+            x = x.transpose(0, 1, 3, 2, 4, 5).reshape(n, width // side, depth // side, -1)
+            x = nn.relu(nn.Dense(channels)(x))
+        return x.reshape(len(x), -1)
+
+
+class PaperEncoder(nn.Module):
+    """The published convolutions: 2D for the snake, 3D with coordinates for the Fetch."""
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(self, image: jax.Array, train: bool) -> jax.Array:
+        """Features (n, F) of occupancies (n, X, Y, Z)."""
+        config = self.config
+        key = (config.task, config.scope)
+        layers = _CONVOLUTIONS.get(key) or _CONVOLUTIONS[(*key, config.kind)]
+        x = image if config.task == "snake" else _with_coordinates(image)
+        for features, kernel, stride, padding, normalised, pooled in layers:
+            x = nn.Conv(features, kernel, stride, padding)(x)
+            if normalised:
+                x = nn.BatchNorm(use_running_average=not train, epsilon=1e-4, momentum=0.9)(x)
+            x = nn.leaky_relu(x, 0.1 if config.task == "fetch" else 0.01)
+            if pooled:
+                x = nn.max_pool(x, (2,) * len(kernel), (2,) * len(kernel))
+        x = x.reshape(len(x), -1)
+        if config.task == "fetch" and config.scope == "map":
+            x = _normalised(nn.Dense(2048)(x), train)
+        return x
+
+
+def _with_coordinates(image: jax.Array) -> jax.Array:
+    """Occupancy and the centres of its cells [m], as four channels (n, X, Y, Z, 4)."""
+    size = jnp.array(image.shape[1:])
+    cells = jnp.stack(jnp.meshgrid(*map(jnp.arange, image.shape[1:]), indexing="ij"), axis=-1)
+    middle = jnp.array([0.5, 0.5, 0.0]) * size  # heights count from the floor
+    centres = 0.1 * (cells + 0.5 - middle)
+    centres = jnp.broadcast_to(centres, (len(image), *centres.shape))
+    return jnp.concatenate([image[..., None], centres.astype(image.dtype)], axis=-1)
+
+
+def _normalised(x: jax.Array, train: bool, slope: float = 0.01) -> jax.Array:
+    x = nn.BatchNorm(use_running_average=not train, momentum=0.9)(x)
+    return nn.leaky_relu(x, slope)
+
+
+def _encoder(config: ModelConfig) -> nn.Module:
+    return (PaperEncoder if config.paper else PatchEncoder)(config)
+
+
+class Discriminator(nn.Module):
+    """How likely is each candidate to be an (almost) optimal waypoint?"""
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(
+        self,
+        image: jax.Array,
+        start: jax.Array,
+        goal: jax.Array,
+        candidates: jax.Array,
+        relation: jax.Array,
+        train: bool = False,
+    ) -> jax.Array:
+        """Logits (n, C).
+
+        Args:
+            image: (n, X, Y, Z) surroundings of the starts.
+            start: (n, E) features.
+            goal: (n, E') features.
+            candidates: (n, C, E'') features, or (1, C, E'') if all starts share them.
+            relation: (n, C, R) to the surroundings and the ends, in numbers; unused
+                without ``lookup``.
+            train: normalise by this batch.
+        """
+        config = self.config
+        context = jnp.concatenate([_encoder(config)(image, train), start, goal], axis=-1)
+        if config.paper:
+            # The published first layer reads all features side by side: the same sum, in parts.
+            x = nn.Dense(config.width)(context)[:, None]
+            x = x + nn.Dense(config.width, use_bias=False)(candidates)
+            x = _normalised(x, train)
+            if config.task == "fetch":
+                for _ in range(2):
+                    x = _normalised(nn.Dense(config.width)(x), train)
+                x = nn.leaky_relu(nn.Dense(256)(x), 0.01)
+            return nn.Dense(1)(x)[..., 0]
+        context = nn.relu(nn.Dense(config.context)(context))
+        context = nn.relu(nn.Dense(config.context)(context))
+        shift, scale = jnp.split(nn.Dense(2 * config.width)(context)[:, None], 2, axis=-1)
+        x = nn.Dense(config.width)(candidates)
+        if config.lookup:
+            x = x + nn.Dense(config.width, use_bias=False)(relation)
+        x = nn.relu(x * (1 + scale) + shift)
+        x = nn.relu(nn.Dense(config.width)(x))
+        return nn.Dense(1)(x)[..., 0]
+
+
+class CVAE(nn.Module):
+    """Generates waypoints from a latent; its encoder is for training alone."""
+
+    config: ModelConfig
+    num_outputs: int
+
+    def setup(self):
+        """Towers of encoder and decoder; the light model shares the image's."""
+        config = self.config
+        self.decoder_image = _encoder(config)
+        self.encoder_image = _encoder(config) if config.paper else None
+        self.encoder = Layers(config, 2 * config.latent)
+        self.decoder = Layers(config, self.num_outputs)
+
+    def __call__(self, image, start, goal, waypoints, key, train: bool = False):
+        """Encode waypoints (n, C, E), sample latents and decode them.
+
+        Returns:
+            The reconstruction (n, C, E); mean and log variance (n, C, latent).
+        """
+        seen = self.decoder_image(image, train)
+        own = self.encoder_image(image, train) if self.encoder_image else seen
+        context = jnp.concatenate([own, start, goal], axis=-1)
+        mean, log_variance = jnp.split(self.encoder(context, waypoints, train), 2, axis=-1)
+        z = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
+        return self._decode(seen, start, goal, z, train), mean, log_variance
+
+    def decode(self, image, start, goal, z):
+        """Waypoint features (n, C, E) for latents (n, C, latent)."""
+        return self._decode(self.decoder_image(image, False), start, goal, z, False)
+
+    def _decode(self, seen, start, goal, z, train: bool):
+        made = self.decoder(jnp.concatenate([seen, start, goal], axis=-1), z, train)
+        # What is to be generated is a step away from the start.
+        return made if self.config.paper else made + start[:, None]
+
+
+class Layers(nn.Module):
+    """Fully connected layers on a context (n, F) joined with C inputs (n, C, E) each."""
+
+    config: ModelConfig
+    num_outputs: int
+
+    @nn.compact
+    def __call__(self, context: jax.Array, inputs: jax.Array, train: bool) -> jax.Array:
+        """Outputs (n, C, num_outputs)."""
+        config = self.config
+        if config.paper:
+            x = nn.Dense(config.width)(context)[:, None]
+            x = x + nn.Dense(config.width, use_bias=False)(inputs)
+            x = _normalised(x, train, 0.0)
+            for _ in range(2):
+                x = _normalised(nn.Dense(config.width)(x), train, 0.0)
+            return nn.Dense(self.num_outputs)(x)
+        context = nn.relu(nn.Dense(config.context)(context))
+        x = nn.Dense(config.width)(context)[:, None] + nn.Dense(config.width)(inputs)
+        x = nn.relu(x)
+        for _ in range(2):
+            x = nn.relu(nn.Dense(config.width)(x))
+        return nn.Dense(self.num_outputs)(x)
+
+
+def discriminator_loss(logits: jax.Array, target: jax.Array, mask: jax.Array) -> jax.Array:
+    """Binary cross-entropy (), over the rows of (n, C) that the mask keeps."""
+    entropy = jax.nn.softplus(logits) - target * logits
+    return jnp.sum(entropy * mask) / jnp.maximum(jnp.sum(mask), 1.0)
+
+
+def cvae_loss(
+    config: ModelConfig,
+    waypoints: jax.Array,
+    reconstruction: jax.Array,
+    mean: jax.Array,
+    log_variance: jax.Array,
+    mask: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The CVAE's objective: squared error of the features plus the weighted KL divergence.
+
+    Returns:
+        The loss, the reconstruction error and the KL divergence [nat], all ().
+    """
+    total = jnp.maximum(jnp.sum(mask), 1.0)
+    error = jnp.sum(jnp.mean((reconstruction - waypoints) ** 2, axis=-1) * mask) / total
+    divergence = 0.5 * jnp.sum(jnp.exp(log_variance) + mean**2 - 1.0 - log_variance, axis=-1)
+    divergence = jnp.sum(divergence * mask) / total
+    return error + config.kl_weight * divergence, error, divergence

@@ -1,0 +1,257 @@
+"""Learned samplers: waypoints for many starts and goals at once.
+
+Pytrees, so that other weights never re-compile a planner. Letters: ``B`` lanes, ``C`` candidates,
+``D`` joints, ``E`` features.
+"""
+
+import functools
+from pathlib import Path
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from nrp_jax import features
+from nrp_jax.checkpoint import Model, build_module, check_model, load_model
+from nrp_jax.context import SIDE
+from nrp_jax.examples import RESOLUTION, describe, relations, surrounding_map, view
+from nrp_jax.field import FINE
+from nrp_jax.models import CVAE, ModelConfig, check_choices
+from nrp_jax.robots import MobileRobot, link_features, load_robot
+from nrp_jax.world import GridWorld
+from vrrt_jax.core.edges import difference, into_limits, points_along
+from vrrt_jax.core.types import pytree, static
+
+REACH = SIDE / 2 * RESOLUTION  # of a window from its middle [m]
+POSTURES = 16  # between a start's and a goal's
+SPREAD = 1.0  # how far at most a joint is off these postures [rad] or [m]
+
+
+class Sampler(Protocol):
+    """Proposes where a planner should go next."""
+
+    def propose(
+        self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
+    ) -> jax.Array:
+        """Waypoints (B, D) inside the limits, from starts (B, D) on the way to goals (B, D)."""
+        ...
+
+
+@pytree
+class Discriminator:
+    """NRP-d: the best of many random candidates, in the eyes of the discriminator.
+
+    Half of the candidates have any posture, half one between the start's and the goal's. The goal
+    itself is one where it lies in the window. Those that stand in something solid, or behind it on
+    the straight line, are out before the network looks.
+    """
+
+    robot: MobileRobot
+    variables: Any
+    config: ModelConfig = static()
+    candidates: int = static(default=500)
+    along: float = static(default=0.5)  # share of candidates with a posture between the ends'
+    judged: int = static(default=192)  # most that the network looks at
+    checked: int = static(default=4)  # of the best, the first whose edge seems free is taken
+    edge_checks: int = static(default=4)  # configurations looked at along each of these edges
+
+    def propose(
+        self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
+    ) -> jax.Array:
+        """See :class:`Sampler`."""
+        sight = _look(self.config, self.robot, world, q_from, q_goal)
+        q, points = self._candidates(world, q_from, q_goal, key)
+        if self.config.scope == "map":  # its frame is the map's, candidates are about the start
+            shift = jnp.pad(features.to_local(q_from, sight.centre)[:, :2], ((0, 0), (0, 1)))
+            q = q.at[..., :2].add(shift[:, None, :2])
+            points = points + shift[:, None, None]
+        q = jnp.concatenate([sight.goal_q[:, None], q], axis=1)
+        points = jnp.concatenate([sight.goal_points[:, None], points], axis=1)
+        near = jnp.max(jnp.abs(q_goal - q_from)[:, :2], axis=1) < REACH
+        possible = jnp.ones(q.shape[:2], bool).at[:, 0].set(near)
+        relation = jax.vmap(functools.partial(relations, self.robot))(
+            sight.image, sight.start_q, sight.goal_q, q, points
+        )
+        if self.config.lookup and self.judged < q.shape[1]:
+            blocked = jnp.min(relation[..., :-4], axis=-1) <= 0
+            rank = jnp.where(possible, jnp.where(blocked, 1.0, 2.0), 0.0)
+            _, kept = jax.lax.top_k(rank, self.judged)
+            q, points, relation, possible = jax.vmap(
+                lambda kept, arrays: jax.tree.map(lambda x: x[kept], arrays)
+            )(kept, (q, points, relation, possible))
+        module = build_module(self.config, 0)
+        logits = module.apply(
+            self.variables,
+            sight.image,
+            sight.start,
+            sight.goal,
+            describe(self.config, self.robot, q, points),
+            relation,
+        )
+        many = min(self.checked, q.shape[1])
+        _, best = jax.lax.top_k(jnp.where(possible, logits, -jnp.inf), many)
+        chosen = jnp.take_along_axis(q, best[..., None], axis=1)
+        chosen = into_limits(world, features.to_world(chosen, sight.centre[:, None]))
+        return _first_free(world, q_from, chosen, self.edge_checks)
+
+    def _candidates(
+        self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Local configurations (B, C, D) and their frames (B, C, F, 3)."""
+        key_any, key_posture, key_place = jax.random.split(key, 3)
+        lanes, num_along = len(q_from), round(self.along * self.candidates / POSTURES)
+        num_any = self.candidates - num_along * POSTURES
+        # All lanes share these, so that their kinematics are computed once.
+        low, high = world.lower.at[:2].set(-REACH), world.upper.at[:2].set(REACH)
+        q = jax.random.uniform(key_any, (num_any, len(low)), minval=low, maxval=high)
+        both = (q, jax.vmap(lambda q: link_features(self.robot, q))(q))
+        anywhere = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), both)
+        if not num_along:
+            return anywhere
+        q = _postures(self.robot, world, q_from, q_goal, key_posture)
+        frames = jax.vmap(jax.vmap(lambda q: link_features(self.robot, q)))(q)
+        place = jax.random.uniform(
+            key_place, (lanes, num_along, POSTURES, 2), minval=-REACH, maxval=REACH
+        )
+        q = jnp.broadcast_to(q[:, None], (*place.shape[:3], q.shape[-1])).at[..., :2].set(place)
+        frames = frames[:, None] + jnp.pad(place, [(0, 0)] * 3 + [(0, 1)])[..., None, :]
+        along = jax.tree.map(lambda x: x.reshape(lanes, -1, *x.shape[3:]), (q, frames))
+        return jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), along, anywhere)
+
+
+@pytree
+class Generator:
+    """NRP-g: what the CVAE's decoder makes of random latents."""
+
+    robot: MobileRobot
+    variables: Any
+    config: ModelConfig = static()
+    num_outputs: int = static()
+    draws: int = static(default=1)  # latents, of which the first whose edge seems free is taken
+    edge_checks: int = static(default=4)  # configurations looked at along each of these edges
+
+    def propose(
+        self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
+    ) -> jax.Array:
+        """See :class:`Sampler`."""
+        sight = _look(self.config, self.robot, world, q_from, q_goal)
+        z = jax.random.normal(key, (len(q_from), self.draws, self.config.latent))
+        module = build_module(self.config, self.num_outputs)
+        made = module.apply(
+            self.variables, sight.image, sight.start, sight.goal, z, method=CVAE.decode
+        )
+        q = features.to_configuration(self.config, self.robot, made)
+        q = into_limits(world, features.to_world(q, sight.centre[:, None]))
+        return _first_free(world, q_from, q, self.edge_checks)
+
+
+@pytree
+class _Sight:
+    """What the networks are told about B starts and goals."""
+
+    image: jax.Array  # (B, X, Y, Z)
+    centre: jax.Array  # (B, 2) of the local frames [m]
+    start: jax.Array  # (B, E)
+    goal: jax.Array  # (B, E')
+    start_q: jax.Array  # (B, D) local
+    goal_q: jax.Array  # (B, D) local
+    goal_points: jax.Array  # (B, F, 3) local
+
+
+def _look(
+    config: ModelConfig, robot: MobileRobot, world: GridWorld, q_from: jax.Array, q_goal: jax.Array
+) -> _Sight:
+    padded = surrounding_map(config, world.field)
+    fine = FINE[2 if robot.planar else 3]
+    resolution = world.field.step * fine
+    origin = world.field.origin[:2] + resolution  # the field has a rim of one cell
+    image, centre = jax.vmap(lambda q: view(config, padded, q, resolution, origin))(q_from)
+    ends = jnp.stack([q_from, q_goal], axis=1)
+    ends = features.to_local(ends, centre[:, None])
+    points = jax.vmap(jax.vmap(lambda q: link_features(robot, q)))(ends)
+    return _Sight(
+        image=image,
+        centre=centre,
+        start=describe(config, robot, ends[:, :1], points[:, :1])[:, 0],
+        goal=jax.vmap(lambda q, p: features.goal_features(config, robot, q, p))(
+            ends[:, 1], points[:, 1]
+        ),
+        start_q=ends[:, 0],
+        goal_q=ends[:, 1],
+        goal_points=points[:, 1],
+    )
+
+
+def _postures(
+    robot: MobileRobot, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
+) -> jax.Array:
+    """Configurations (B, POSTURES, D) at the origin, with arms between the starts' and the goals'.
+
+    A base that turns heads anywhere.
+    """
+    step = difference(world, q_from, q_goal)[:, None]
+    q = q_from[:, None] + jnp.linspace(0.0, 1.0, POSTURES)[:, None] * step
+    key_noise, key_scale = jax.random.split(key)
+    noise = jax.random.uniform(key_noise, q.shape, minval=-1.0, maxval=1.0)
+    scale = SPREAD * jax.random.uniform(key_scale, (*q.shape[:2], 1)) ** 2
+    base = jnp.arange(q.shape[-1]) < robot.base_dim
+    q = jnp.where(base, jnp.pi * noise, q + scale * noise)
+    return into_limits(world, q.at[..., :2].set(0.0)).at[..., :2].set(0.0)
+
+
+def _first_free(world: GridWorld, q_from: jax.Array, q: jax.Array, num_checks: int) -> jax.Array:
+    """Of waypoints (B, K, D), best first, the first (B, D) whose edge seems free, or else the best.
+
+    Looks at ``num_checks`` configurations of each edge, the waypoint the last of them.
+    """
+    lanes, many = q.shape[:2]
+    if many == 1:
+        return q[:, 0]
+    repeated = jnp.repeat(q_from, many, axis=0)
+    edge = world.edge(repeated, q.reshape(-1, q.shape[-1]))
+    points = points_along(world, repeated, edge, num_checks)
+    free = jax.vmap(world.is_free)(points.reshape(-1, q.shape[-1]))
+    free = jnp.all(free.reshape(lanes, many, num_checks), axis=2)
+    return jnp.take_along_axis(q, jnp.argmax(free, axis=1)[:, None, None], axis=1)[:, 0]
+
+
+def make_sampler(model: Model, **settings: Any) -> Discriminator | Generator:
+    """A sampler of a trained model; settings are fields such as ``candidates`` or ``draws``."""
+    robot, config = load_robot(model.config.task), model.config
+    shared = {"robot": robot, "variables": model.variables, "config": config, **settings}
+    if config.kind == "discriminator":
+        return Discriminator(**shared)
+    return Generator(num_outputs=model.info["num_outputs"], **shared)
+
+
+def load_sampler(
+    task: str, kind: str, path: str | Path | None = None, **settings: Any
+) -> Discriminator | Generator:
+    """Load a sampler's weights.
+
+    Args:
+        task: "snake" or "fetch".
+        kind: "discriminator" or "cvae".
+        path: what ``nrp train`` wrote, a folder or its ``model.npz``; the packaged weights if None.
+        settings: fields of :class:`Discriminator` or :class:`Generator` to set.
+
+    Raises:
+        ValueError: there is no such model, or it is for another task or of another kind.
+    """
+    check_choices(task, kind)
+    path = Path(__file__).parent / "weights" / f"{task}_{kind}.npz" if path is None else Path(path)
+    model = load_model(path)
+    check_model(model, path, task=task, kind=kind)
+    return make_sampler(model, **settings)
+
+
+@jax.jit
+def propose(
+    sampler: Discriminator | Generator,
+    world: GridWorld,
+    q_from: jax.Array,
+    q_goal: jax.Array,
+    key: jax.Array,
+) -> jax.Array:
+    """Waypoints (B, D), compiled, for use from the host; see :class:`Sampler`."""
+    return sampler.propose(world, q_from, q_goal, key)

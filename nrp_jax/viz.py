@@ -1,0 +1,157 @@
+"""Figures: a home from above, the tree that was grown in it, and the robot along its path."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from nrp_jax.grid import Grid
+from nrp_jax.planner import PlanResult
+from nrp_jax.robots import MobileRobot
+from nrp_jax.world import GridWorld
+
+_EDGE_POINTS = 9
+_SHOWN = 4000  # edges of a tree at most
+_COLOURS = {"map": "#3b4252", "above": "#c3c9d4", "tree": "#7aa6c2", "path": "#d1495b"}
+
+
+def outlines(robot: MobileRobot, q: np.ndarray) -> list[np.ndarray]:
+    """The robot from above: a convex polygon (n, 2) for each of its geoms [m].
+
+    Args:
+        robot: from :func:`nrp_jax.load_robot`.
+        q: (D,) configuration.
+    """
+    model = mujoco.MjModel.from_xml_string(robot.xml)
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_kinematics(model, data)
+    polygons = []
+    for geom in range(model.ngeom):
+        points = _outer_points(mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom])
+        points = points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+        flat = points[:, :2]
+        polygons.append(flat[ConvexHull(flat, qhull_options="QJ").vertices])
+    return polygons
+
+
+def draw_map(axes, grid: Grid) -> None:
+    """Draw a map from above; cells that are solid above 0.4 m only are lighter."""
+    low = grid.flatten(z_high=0.4).occupied[:, :, 0]
+    seen = grid.occupied.any(axis=2)
+    shade = np.ones((*seen.shape, 3))
+    shade[seen] = _rgb(_COLOURS["above"])
+    shade[low & seen] = _rgb(_COLOURS["map"])
+    left, bottom = grid.origin[:2]
+    right, top = np.array(grid.origin[:2]) + grid.size[:2]
+    axes.imshow(
+        np.swapaxes(shade, 0, 1),
+        origin="lower",
+        extent=(left, right, bottom, top),
+        interpolation="nearest",
+    )
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+
+
+def draw_robot(axes, robot: MobileRobot, q: np.ndarray, colour: str, alpha: float = 0.8) -> None:
+    """Draw the robot at ``q`` (D,) from above."""
+    from matplotlib.patches import Polygon
+
+    for polygon in outlines(robot, q):
+        axes.add_patch(
+            Polygon(polygon, facecolor=colour, edgecolor="black", linewidth=0.3, alpha=alpha)
+        )
+
+
+def draw_tree(axes, world: GridWorld, result: PlanResult) -> None:
+    """Draw where the base goes along the edges of a tree."""
+    from matplotlib.collections import LineCollection
+
+    size = int(result.tree.size)
+    parent = np.asarray(result.tree.parent)[:size]
+    child = np.flatnonzero(parent >= 0)
+    child = child[:: max(1, -(-len(child) // _SHOWN))]
+    if not len(child):
+        return
+    q = np.asarray(result.tree.q)
+    fraction = jnp.linspace(0, 1, _EDGE_POINTS)[None]
+    lines = jax.jit(lambda w, a, b: w.interpolate(a[:, None], b[:, None], fraction))(
+        world, q[parent[child]], q[child]
+    )
+    axes.add_collection(
+        LineCollection(np.asarray(lines)[..., :2], colors=_COLOURS["tree"], linewidths=0.5)
+    )
+
+
+def save_plan(
+    path: str | Path,
+    robot: MobileRobot,
+    grid: Grid,
+    world: GridWorld,
+    result: PlanResult,
+    q_goal: np.ndarray,
+    *,
+    robots: int = 12,
+) -> None:
+    """Write a figure of a plan: map, tree, path and the robot along it.
+
+    Args:
+        path: a .png, .pdf or .svg file.
+        robot: from :func:`nrp_jax.load_robot`.
+        grid: the home.
+        world: the robot in it.
+        result: from :func:`nrp_jax.plan`.
+        q_goal: (D,) goal.
+        robots: how many are drawn along the path.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg", force=False)
+    import matplotlib.pyplot as plt
+
+    width, height = grid.size[:2]
+    figure, axes = plt.subplots(figsize=(8, 8 * height / width + 0.6), layout="constrained")
+    draw_map(axes, grid)
+    draw_tree(axes, world, result)
+    trajectory = result.trajectory
+    axes.plot(*trajectory[:, :2].T, color=_COLOURS["path"], linewidth=1.5)
+    for index in np.linspace(0, len(trajectory) - 1, min(robots, len(trajectory))).astype(int):
+        draw_robot(axes, robot, trajectory[index], "#e9c46a", alpha=0.5)
+    draw_robot(axes, robot, trajectory[0], "#2a9d8f")
+    draw_robot(axes, robot, q_goal, _COLOURS["path"])
+    axes.set_title(
+        f"{result.status.name.lower()}: {result.cost:.1f} m, {result.expansions} expansions, "
+        f"{result.timing['search_s']:.2f} s search"
+    )
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def _outer_points(kind: mujoco.mjtGeom, size: np.ndarray) -> np.ndarray:
+    """Points (n, 3) whose hull is about the geom, in its frame."""
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        return np.array(np.meshgrid(*[(-h, h) for h in size])).reshape(3, -1).T
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    tilt = np.linspace(-np.pi / 2, np.pi / 2, 7)
+    ball = np.stack(
+        [
+            np.outer(np.cos(tilt), np.cos(angle)).ravel(),
+            np.outer(np.cos(tilt), np.sin(angle)).ravel(),
+            np.repeat(np.sin(tilt), len(angle)),
+        ],
+        axis=1,
+    )
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return size[0] * ball
+    half = np.array([0.0, 0.0, size[1]])
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        return np.concatenate([size[0] * ball + half, size[0] * ball - half])
+    ring = size[0] * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    return np.concatenate([ring + half, ring - half])
+
+
+def _rgb(colour: str) -> tuple[float, ...]:
+    return tuple(int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
