@@ -39,7 +39,9 @@ def save_model(model: Model, path: str | Path) -> None:
     """Write a model; a killed process leaves the former file or the new one."""
     path = Path(path)
     flat = flax.traverse_util.flatten_dict(jax.device_get(model.variables), sep="/")
-    arrays = {f"variables/{name}": np.asarray(leaf, np.float16) for name, leaf in flat.items()}
+    arrays: dict[str, Any] = {
+        f"variables/{name}": np.asarray(leaf, np.float16) for name, leaf in flat.items()
+    }
     description = json.dumps({"config": dataclasses.asdict(model.config), "info": model.info})
     part = path.with_suffix(".part")
     with open(part, "wb") as handle:
@@ -66,8 +68,8 @@ def load_model(path: str | Path) -> Model:
                 for name in saved.files
                 if name != "description"
             }
-        fields = description["config"]
-        fields = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
+        given = description["config"].items()
+        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given}
         config = ModelConfig(**fields)
     except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile):
         raise ValueError(

@@ -5,6 +5,8 @@ base: cell (i, j) of it covers [0.1 (i - 20), 0.1 (i - 19)) from there. Outside 
 is occupied.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,19 +20,25 @@ def pad(occupied: np.ndarray) -> jax.Array:
     return jnp.asarray(np.pad(occupied, border, constant_values=True))
 
 
-def centre_cell(q: jax.Array, resolution=0.1, origin=(0.0, 0.0)) -> jax.Array:
+def centre_cell(
+    q: jax.Array, resolution: jax.Array | float = 0.1, origin: Any = (0.0, 0.0)
+) -> jax.Array:
     """Corner of cells (..., 2) i32 nearest to the base at ``q`` (..., D), from the map's origin."""
     place = q[..., :2] - jnp.asarray(origin, q.dtype)[..., :2]
     return jnp.round(place / resolution).astype(jnp.int32)
 
 
-def centre(q: jax.Array, resolution=0.1, origin=(0.0, 0.0)) -> jax.Array:
+def centre(
+    q: jax.Array, resolution: jax.Array | float = 0.1, origin: Any = (0.0, 0.0)
+) -> jax.Array:
     """Place (..., 2) [m] of the window's centre in the map: the origin of the local frame."""
     cell = centre_cell(q, resolution, origin)
     return cell * resolution + jnp.asarray(origin, q.dtype)[..., :2]
 
 
-def window(padded: jax.Array, q: jax.Array, resolution=0.1, origin=(0.0, 0.0)) -> jax.Array:
+def window(
+    padded: jax.Array, q: jax.Array, resolution: jax.Array | float = 0.1, origin: Any = (0.0, 0.0)
+) -> jax.Array:
     """The window (40, 40, Z) around ``q`` (D,); vmappable.
 
     Args:
@@ -47,7 +55,9 @@ def window(padded: jax.Array, q: jax.Array, resolution=0.1, origin=(0.0, 0.0)) -
 windows = jax.jit(jax.vmap(window, (None, 0, None, None)))  # of q (n, D): (n, 40, 40, Z)
 
 
-def stacked_window(padded: jax.Array, index: jax.Array, q: jax.Array, resolution=0.1) -> jax.Array:
+def stacked_window(
+    padded: jax.Array, index: jax.Array, q: jax.Array, resolution: jax.Array | float = 0.1
+) -> jax.Array:
     """The window (40, 40, Z) around ``q`` in map ``index`` of several (H, X + 40, Y + 40, Z)."""
     corner = centre_cell(q, resolution)
     size = (1, SIDE, SIDE, padded.shape[3])

@@ -20,7 +20,7 @@ import numpy as np
 from nrp_jax import houses
 from nrp_jax.grid import Grid
 
-VERSION = 1  # of the rows
+VERSION = 2  # of the rows
 MANIFEST = "manifest.json"
 ROWS = ("q_start", "q_goal", "waypoint", "optimal", "ratio", "length", "query")
 FIRST_TEST_SEED = 1_000_000  # homes for tests have seeds from here on, those for training below

@@ -181,8 +181,8 @@ def _stack(maps: list[jax.Array], config: ModelConfig) -> np.ndarray:
     """Maps of several sizes as one array, filled up with solid cells."""
     size = np.max([one.shape for one in maps], axis=0)
     stacked = np.full((len(maps), *size), 1.0 if config.paper else 0.0, np.float16)
-    for into, one in zip(stacked, maps, strict=True):
-        into[: one.shape[0], : one.shape[1], : one.shape[2]] = np.asarray(one)
+    for k, one in enumerate(maps):
+        stacked[k, : one.shape[0], : one.shape[1], : one.shape[2]] = np.asarray(one)
     return stacked
 
 

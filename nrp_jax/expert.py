@@ -114,7 +114,7 @@ class Extents:
         self.low = np.minimum(points.min(1), -radius)  # (N, 2) [m]
         self.high = np.maximum(points.max(1), radius)  # (N, 2) [m]
 
-    def inside(self, whose: np.ndarray, who: np.ndarray | slice) -> np.ndarray:
+    def inside(self, whose: np.ndarray | int, who: np.ndarray | slice) -> np.ndarray:
         """Whether robots ``who`` are wholly inside the windows around robots ``whose``, (...)."""
         step = self.base[who] - self.base[whose]
         far = np.maximum(step + self.high[who], -step - self.low[who])

@@ -8,6 +8,7 @@ cells of 0.1 m; the same seed gives the same home.
 import argparse
 import dataclasses
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 from scipy import ndimage
@@ -63,14 +64,25 @@ def generate_house(seed: int, kind: str = "snake", clutter: float = 1.0) -> Hous
 
 def is_connected(grid: Grid, kind: str) -> bool:
     """Whether the floor where a robot's base has 0.3 m of air around it is one piece."""
-    return int(ndimage.label(floor(grid, kind))[1]) == 1
+    return _pieces(floor(grid, kind))[1] == 1
 
 
 def floor(grid: Grid, kind: str) -> np.ndarray:
     """Cells (X, Y) whose centres have 0.3 m of air around them at the heights of a robot's body."""
     plan = grid.flatten(0.0, BODY[kind]).occupied[:, :, 0]
     # Distances run between centres of cells: half a cell of each belongs to the obstacle.
-    return ndimage.distance_transform_edt(~plan) * grid.resolution > ERODE + 0.5 * grid.resolution
+    return _distance(~plan) * grid.resolution > ERODE + 0.5 * grid.resolution
+
+
+def _pieces(mask: np.ndarray) -> tuple[np.ndarray, int]:
+    """Connected pieces as labels of the cells, and how many there are."""
+    labels, count = cast(Any, ndimage.label(mask))
+    return labels, int(count)
+
+
+def _distance(mask: np.ndarray) -> np.ndarray:
+    """Distance of every cell to the nearest one outside [cells]."""
+    return cast(np.ndarray, ndimage.distance_transform_edt(mask))
 
 
 def _attempt(rng: np.random.Generator, seed: int, kind: str, clutter: float) -> House | None:
@@ -79,7 +91,7 @@ def _attempt(rng: np.random.Generator, seed: int, kind: str, clutter: float) -> 
     num_rooms = int(rng.integers(4, 7) if kind == "snake" else rng.integers(5, 9))
     plan = make_floor_plan(rng, side, width, depth, num_rooms)
     draft = _Draft(plan, round(10 * BODY[kind]))
-    if ndimage.label(~draft.blocked)[1] != 1:
+    if _pieces(~draft.blocked)[1] != 1:
         return None  # then nothing could be placed
     for door in plan.doors:
         draft.keep_clear(door)
@@ -122,7 +134,7 @@ class _Draft:
         i, j = np.ogrid[-SPREAD : SPREAD + 1, -SPREAD : SPREAD + 1]
         self.disc = i**2 + j**2 < (SPREAD + 0.5) ** 2
         # Where the centre of the base cannot be; a little less near walls, so that doors pass.
-        self.blocked = ndimage.distance_transform_edt(~self.walls) <= SPREAD - 0.5
+        self.blocked = _distance(~self.walls) <= SPREAD - 0.5
 
     def keep_clear(self, door: Room, reach: int = 6) -> None:
         """No furniture in a door nor right before it."""
@@ -141,13 +153,13 @@ class _Draft:
         if (self.taken[here] & footprint).any() or (clear and (self.clear[here] & footprint).any()):
             return False
         base = np.pad(volume[:, :, : self.body].any(2), SPREAD)
-        grown = ndimage.binary_dilation(base, self.disc)
+        grown = cast(np.ndarray, ndimage.binary_dilation(base, self.disc))
         i, j = max(x - SPREAD, 0), max(y - SPREAD, 0)
         around = (slice(i, x + w + SPREAD), slice(j, y + d + SPREAD))
         before = self.blocked[around].copy()
         grown = grown[i - x + SPREAD :, j - y + SPREAD :][: before.shape[0], : before.shape[1]]
         self.blocked[around] |= grown
-        if ndimage.label(~self.blocked)[1] != 1:
+        if _pieces(~self.blocked)[1] != 1:
             self.blocked[around] = before
             return False
         self.taken[here] |= footprint
@@ -198,13 +210,13 @@ def _scan(rng: np.random.Generator, draft: _Draft, kind: str) -> np.ndarray:
     # Rags hang together over half a metre of height.
     ragged = np.repeat(rng.random((*plan, 4)) < 0.13, HEIGHT // 4, axis=2)
     blobs = ndimage.binary_dilation(rng.random(plan) < 0.002, iterations=2)
-    near_wall = ndimage.binary_dilation(draft.walls, iterations=2)
+    near_wall = cast(np.ndarray, ndimage.binary_dilation(draft.walls, iterations=2))
     specks = rng.random(plan) < 0.0015
     noise = (beside & ragged) | (blobs & near_wall | specks)[:, :, None]
     occupied |= noise & ~draft.clear[:, :, None]
     occupied[[0, -1]] = occupied[:, [0, -1]] = True
     # Places that the base could stand in but never reach are filled.
-    pieces, count = ndimage.label(floor(Grid(occupied=occupied), kind))
+    pieces, count = _pieces(floor(Grid(occupied=occupied), kind))
     if count > 1:
         sizes = np.bincount(pieces.ravel())[1:]
         lost = (pieces > 0) & (pieces != 1 + int(sizes.argmax()))
@@ -244,7 +256,7 @@ def _draw(axis, house: House) -> None:
     over = standing & ~occupied[:, :, 0]
     image[over] = 0.45 * image[over] + 0.55 * np.array([0.55, 0.75, 0.95])
     image[house.walls] = 0.2
-    size = 0.1 * len(standing)
+    size = 0.1 * occupied.shape[0]
     axis.imshow(image.swapaxes(0, 1), origin="lower", extent=(0, size, 0, size))
     for room in house.rooms:
         axis.text(

@@ -4,7 +4,7 @@ import csv
 import json
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -53,7 +53,7 @@ class Keeper:
             return
         self._saved = time.monotonic()
         arrays = ocp.args.StandardSave({"state": _plain(state), "best": best})
-        arguments = ocp.args.Composite(arrays=arrays, history=ocp.args.JsonSave(history))
+        arguments = ocp.args.Composite(arrays=arrays, history=ocp.args.JsonSave(cast(Any, history)))
         self._manager.save(len(history), args=arguments)
         self._manager.wait_until_finished()
 

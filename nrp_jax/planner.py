@@ -170,20 +170,21 @@ def check_configuration(
             f"the {what}'s {robot.joint_names[joint]} is {q[joint]}; {place} "
             f"[{lower[joint]:.3f}, {upper[joint]:.3f}]"
         )
-    q = world.normalise(jnp.clip(q, jnp.where(wraps, q, lower), jnp.where(wraps, q, upper)))
-    if not batch_is_free(world, q[None])[0]:
+    low, high = np.where(wraps, q, lower), np.where(wraps, q, upper)
+    inside = world.normalise(jnp.asarray(np.clip(q, low, high)))
+    if not batch_is_free(world, inside[None])[0]:
         raise ValueError(
             f"the {what} touches the map, the floor or the robot itself: {np.round(q, 3).tolist()};"
             " choose another one"
         )
-    return q
+    return inside
 
 
 def trajectory_of(world: GridWorld, path: np.ndarray) -> np.ndarray:
     """A path (P, D) in steps (T, D) of 0.02 m or rad at most."""
     if len(path) < 2:
         return np.asarray(path)
-    edges = world.edge(path[:-1], path[1:])
+    edges = world.edge(jnp.asarray(path[:-1]), jnp.asarray(path[1:]))
     counts = np.maximum(np.ceil(np.asarray(world.span(edges)) / STEP), 1).astype(int)
     index = np.repeat(np.arange(len(counts)), counts)
     within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + 1

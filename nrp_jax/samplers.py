@@ -79,7 +79,7 @@ class Discriminator:
             q, points, relation, possible = jax.vmap(
                 lambda kept, arrays: jax.tree.map(lambda x: x[kept], arrays)
             )(kept, (q, points, relation, possible))
-        module = build_module(self.config, 0)
+        module: Any = build_module(self.config, 0)
         logits = module.apply(
             self.variables,
             sight.image,
@@ -136,7 +136,7 @@ class Generator:
         """See :class:`Sampler`."""
         sight = _look(self.config, self.robot, world, q_from, q_goal)
         z = jax.random.normal(key, (len(q_from), self.draws, self.config.latent))
-        module = build_module(self.config, self.num_outputs)
+        module: Any = build_module(self.config, self.num_outputs)
         made = module.apply(
             self.variables, sight.image, sight.start, sight.goal, z, method=CVAE.decode
         )

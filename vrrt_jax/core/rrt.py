@@ -1,6 +1,7 @@
 """RRT, RRT* and RRT-Connect to a joint goal, as policies of the kernel."""
 
 import dataclasses
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -122,8 +123,8 @@ class RRTConnect:
         # Half of the samples near the two ends: where limits are far apart, few others serve.
         q_start, q_goal = tree.q[:2]
         ends = jnp.stack([q_start, world.end(q_start, world.edge(q_start, q_goal))])
-        near = dataclasses.replace(
-            world,
+        near: Space = dataclasses.replace(
+            cast(Any, world),
             lower=jnp.maximum(world.lower, jnp.min(ends, axis=0) - self.margin),
             upper=jnp.minimum(world.upper, jnp.max(ends, axis=0) + self.margin),
         )
