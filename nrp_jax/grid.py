@@ -223,7 +223,7 @@ def _read_mjcf(path: Path) -> Grid:
     )
     if not len(geoms):
         raise ValueError("the scene has no geom to collide with but planes")
-    boxes = [_bounds(model, data, g) for g in geoms]
+    boxes = [_bounds(model, data, int(g)) for g in geoms]
     low = np.append(np.min([b[0] for b in boxes], axis=0)[:2], 0.0)
     high = np.append(np.max([b[1] for b in boxes], axis=0)[:2], HEIGHT)
     first = np.floor(low / RESOLUTION + 1e-6).astype(int)

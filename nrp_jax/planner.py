@@ -16,6 +16,7 @@ from nrp_jax.policies import RRT, NeuralRRT
 from nrp_jax.robots import MobileRobot
 from nrp_jax.world import CarWorld, GridWorld, batch_is_free, build_world
 from vrrt_jax.core import tree as trees
+from vrrt_jax.core.edges import into_limits
 from vrrt_jax.core.rrt import RRTConnect, connection_path, tree_path
 from vrrt_jax.core.search import SearchResult, Stopped, make_stop, search
 from vrrt_jax.core.shortcut import path_length, shortcut
@@ -170,20 +171,20 @@ def check_configuration(
             f"the {what}'s {robot.joint_names[joint]} is {q[joint]}; {place} "
             f"[{lower[joint]:.3f}, {upper[joint]:.3f}]"
         )
-    q = world.normalise(jnp.clip(q, jnp.where(wraps, q, lower), jnp.where(wraps, q, upper)))
-    if not batch_is_free(world, q[None])[0]:
+    inside = into_limits(world, jnp.asarray(q))
+    if not batch_is_free(world, inside[None])[0]:
         raise ValueError(
             f"the {what} touches the map, the floor or the robot itself: {np.round(q, 3).tolist()};"
             " choose another one"
         )
-    return q
+    return inside
 
 
 def trajectory_of(world: GridWorld, path: np.ndarray) -> np.ndarray:
     """A path (P, D) in steps (T, D) of 0.02 m or rad at most."""
     if len(path) < 2:
         return np.asarray(path)
-    edges = world.edge(path[:-1], path[1:])
+    edges = world.edge(jnp.asarray(path[:-1]), jnp.asarray(path[1:]))
     counts = np.maximum(np.ceil(np.asarray(world.span(edges)) / STEP), 1).astype(int)
     index = np.repeat(np.arange(len(counts)), counts)
     within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + 1

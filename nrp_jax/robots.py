@@ -176,7 +176,7 @@ def _cover(
         centres, radii = cover_geom(
             mujoco.mjtGeom(model.geom_type[geom]),
             model.geom_size[geom] * ([1, 1, 0] if planar else [1, 1, 1]),
-            grain[geom],
+            float(grain[geom]),
         )
         body = model.geom_bodyid[geom]
         rotation = np.zeros(9)

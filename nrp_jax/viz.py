@@ -82,7 +82,7 @@ def draw_tree(axes, world: GridWorld, result: PlanResult) -> None:
         world, q[parent[child]], q[child]
     )
     axes.add_collection(
-        LineCollection(np.asarray(lines)[..., :2], colors=_COLOURS["tree"], linewidths=0.5)
+        LineCollection(list(np.asarray(lines)[..., :2]), colors=_COLOURS["tree"], linewidths=0.5)
     )
 
 

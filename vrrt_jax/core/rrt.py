@@ -122,15 +122,13 @@ class RRTConnect:
         # Half of the samples near the two ends: where limits are far apart, few others serve.
         q_start, q_goal = tree.q[:2]
         ends = jnp.stack([q_start, world.end(q_start, world.edge(q_start, q_goal))])
-        near = dataclasses.replace(
-            world,
-            lower=jnp.maximum(world.lower, jnp.min(ends, axis=0) - self.margin),
-            upper=jnp.minimum(world.upper, jnp.max(ends, axis=0) + self.margin),
-        )
+        lower = jnp.maximum(world.lower, jnp.min(ends, axis=0) - self.margin)
+        upper = jnp.minimum(world.upper, jnp.max(ends, axis=0) + self.margin)
         key_near, key_far = jax.random.split(key)
+        aim_shape = (self.lanes, lower.shape[0])
         sample = jnp.where(
             (lane // 2 % 2 == 0)[:, None],
-            sample_configurations(near, key_near, self.lanes),
+            jax.random.uniform(key_near, aim_shape, minval=lower, maxval=upper),
             sample_configurations(world, key_far, self.lanes),
         )
         aim = jnp.where(connects[:, None], tree.q[chosen], sample)
