@@ -212,9 +212,7 @@ def make_batch(
             q[:, 1], points[:, 1]
         ),
         waypoints=described[:, 2:],
-        relation=jax.vmap(functools.partial(relations, robot))(
-            image, q[:, 0], q[:, 1], q[:, 2:], points[:, 2:]
-        ),
+        relation=jax.vmap(functools.partial(relations, robot))(image, q, points),
         target=examples.target[chosen],
         weight=examples.weight[chosen],
     )
@@ -240,30 +238,25 @@ def _local(config: ModelConfig, examples: Examples, index: jax.Array):
     return image.astype(jnp.float32), features.to_local(q, centre), points
 
 
-def relations(
-    robot: MobileRobot,
-    image: jax.Array,
-    start: jax.Array,
-    goal: jax.Array,
-    q: jax.Array,
-    points: jax.Array,
-) -> jax.Array:
-    """How candidates lie to their surroundings and to the ends: (C, R).
+def relations(robot: MobileRobot, image: jax.Array, q: jax.Array, points: jax.Array) -> jax.Array:
+    """How candidates lie to their surroundings and to the ends.
 
     Args:
         robot: whose configurations they are.
         image: (X, Y, Z) around the start.
-        start: (D,) local.
-        goal: (D,) local.
-        q: (C, D) local candidates.
-        points: (C, F, 3) their link frames [m].
+        q: (2 + C, D) start, goal and candidates, local.
+        points: (2 + C, F, 3) their link frames [m].
 
     Returns:
-        What the image holds where each would be; steps of base and arm from the start and to the
-        goal.
+        (C, R): what the image holds along the way from the start, at last where the candidate
+        stands; steps of base and arm from the start and to the goal.
     """
-    touched = jax.vmap(functools.partial(features.clearance_points, robot))(q, points)
-    clearance = image.reshape(-1)[features.cells(touched, image.shape, RESOLUTION)]
-    return jnp.concatenate(
-        [clearance, features.steps(robot, q, start), features.steps(robot, q, goal)], axis=-1
-    )
+    standing = jax.vmap(functools.partial(features.standing_points, robot))(q, points)
+    passed = jax.vmap(features.passed_points, (None, 0))(standing[0], standing[2:])
+    parts = [read(image, passed), *(features.steps(robot, q[2:], end) for end in q[:2])]
+    return jnp.concatenate(parts, axis=-1)
+
+
+def read(image: jax.Array, points: jax.Array) -> jax.Array:
+    """What an image (X, Y, Z) holds at local points (..., 3) [m], (...)."""
+    return image.reshape(-1)[features.cells(points, image.shape, RESOLUTION)]

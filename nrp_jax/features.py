@@ -14,6 +14,7 @@ from nrp_jax.robots import MobileRobot
 
 FAR = 6.0  # goals farther than this look as if they were this far [m]
 CLEAR = 1.0  # distances to obstacles beyond this do not matter [m]
+WAY = 4  # places along an edge at which the surroundings are read
 HEADING = 2  # the joint that turns the whole robot, for both robots
 
 
@@ -87,15 +88,20 @@ def to_configuration(config: ModelConfig, robot: MobileRobot, features: jax.Arra
     return jnp.concatenate([linear, jnp.arctan2(sine, cosine)], axis=-1)[..., order]
 
 
-def clearance_points(robot: MobileRobot, q: jax.Array, points: jax.Array) -> jax.Array:
-    """Points (P, 3) [m] at which a local waypoint (D,) meets the surroundings.
-
-    Its link frames (F, 3), its base, and the base's way there from the origin.
-    """
+def standing_points(robot: MobileRobot, q: jax.Array, points: jax.Array) -> jax.Array:
+    """Where a local configuration (D,) stands: its link frames (F, 3) and its base, (P, 3) [m]."""
     heights = jnp.array([0.0] if robot.planar else [0.1, 0.5, 0.9])
-    way = jnp.linspace(0.25, 1.0, 4)[:, None, None] * jnp.append(q[:2], 0.0)
-    way = way + jnp.stack([0 * heights, 0 * heights, heights], axis=-1)
-    return jnp.concatenate([points, way.reshape(-1, 3)])
+    base = jnp.append(q[:2], 0.0) + heights[:, None] * jnp.array([0.0, 0.0, 1.0])
+    return jnp.concatenate([points, base])
+
+
+def passed_points(start: jax.Array, end: jax.Array) -> jax.Array:
+    """Points (WAY * P, 3) near the way of points from their start (P, 3) to their end (P, 3) [m].
+
+    They go straight here, as they nearly do where the posture changes little.
+    """
+    fraction = jnp.arange(1, WAY + 1)[:, None, None] / WAY
+    return (start + fraction * (end - start)).reshape(-1, 3)
 
 
 def cells(points: jax.Array, shape: tuple[int, ...], resolution: float) -> jax.Array:

@@ -16,6 +16,7 @@ from nrp_jax.policies import RRT, NeuralRRT
 from nrp_jax.robots import MobileRobot
 from nrp_jax.world import CarWorld, GridWorld, batch_is_free, build_world
 from vrrt_jax.core import tree as trees
+from vrrt_jax.core.edges import into_limits
 from vrrt_jax.core.rrt import RRTConnect, connection_path, tree_path
 from vrrt_jax.core.search import SearchResult, Stopped, make_stop, search
 from vrrt_jax.core.shortcut import path_length, shortcut

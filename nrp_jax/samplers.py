@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from nrp_jax import features
 from nrp_jax.checkpoint import Model, build_module, check_model, load_model
 from nrp_jax.context import SIDE
-from nrp_jax.examples import RESOLUTION, describe, relations, surrounding_map, view
+from nrp_jax.examples import RESOLUTION, describe, read, relations, surrounding_map, view
 from nrp_jax.field import FINE
 from nrp_jax.models import CVAE, ModelConfig, check_choices
 from nrp_jax.robots import MobileRobot, link_features, load_robot
@@ -42,8 +42,8 @@ class Discriminator:
     """NRP-d: the best of many random candidates, in the eyes of the discriminator.
 
     Half of the candidates have any posture, half one between the start's and the goal's. The goal
-    itself is one where it lies in the window. Those that stand in something solid, or behind it on
-    the straight line, are out before the network looks.
+    itself is one where it lies in the window. Those that stand in something solid are out
+    before the network looks.
     """
 
     robot: MobileRobot
@@ -65,18 +65,16 @@ class Discriminator:
             shift = jnp.pad(features.to_local(q_from, sight.centre)[:, :2], ((0, 0), (0, 1)))
             q = q.at[..., :2].add(shift[:, None, :2])
             points = points + shift[:, None, None]
-        q = jnp.concatenate([sight.goal_q[:, None], q], axis=1)
-        points = jnp.concatenate([sight.goal_points[:, None], points], axis=1)
+        q = jnp.concatenate([sight.ends[:, 1:], q], axis=1)
+        points = jnp.concatenate([sight.end_points[:, 1:], points], axis=1)
         near = jnp.max(jnp.abs(q_goal - q_from)[:, :2], axis=1) < REACH
         possible = jnp.ones(q.shape[:2], bool).at[:, 0].set(near)
-        relation = jax.vmap(functools.partial(relations, self.robot))(
-            sight.image, sight.start_q, sight.goal_q, q, points
-        )
         if self.config.lookup and self.judged < q.shape[1]:
-            blocked = jnp.min(relation[..., :-4], axis=-1) <= 0
+            standing = jax.vmap(jax.vmap(functools.partial(features.standing_points, self.robot)))
+            blocked = jnp.min(jax.vmap(read)(sight.image, standing(q, points)), axis=-1) <= 0
             rank = jnp.where(possible, jnp.where(blocked, 1.0, 2.0), 0.0)
             _, kept = jax.lax.top_k(rank, self.judged)
-            q, points, relation, possible = jax.vmap(
+            q, points, possible = jax.vmap(
                 lambda kept, arrays: jax.tree.map(lambda x: x[kept], arrays)
             )(kept, (q, points, relation, possible))
         module: Any = build_module(self.config, 0)
@@ -153,9 +151,8 @@ class _Sight:
     centre: jax.Array  # (B, 2) of the local frames [m]
     start: jax.Array  # (B, E)
     goal: jax.Array  # (B, E')
-    start_q: jax.Array  # (B, D) local
-    goal_q: jax.Array  # (B, D) local
-    goal_points: jax.Array  # (B, F, 3) local
+    ends: jax.Array  # (B, 2, D) local
+    end_points: jax.Array  # (B, 2, F, 3) their link frames, local [m]
 
 
 def _look(
@@ -176,9 +173,8 @@ def _look(
         goal=jax.vmap(lambda q, p: features.goal_features(config, robot, q, p))(
             ends[:, 1], points[:, 1]
         ),
-        start_q=ends[:, 0],
-        goal_q=ends[:, 1],
-        goal_points=points[:, 1],
+        ends=ends,
+        end_points=points,
     )
 
 

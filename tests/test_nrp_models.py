@@ -30,8 +30,8 @@ def shapes(config: ModelConfig, candidates: int = 3, lanes: int = 2):
         q, points = jnp.zeros(robot.num_joints), jnp.zeros((len(robot.feature_link), 3))
         own = features.configuration_features(config, robot, q, points)
         goal = features.goal_features(config, robot, q, points)
-        ends = jnp.zeros(4)
-        touched = jnp.concatenate([features.clearance_points(robot, q, points)[:, 0], ends])
+        standing = features.standing_points(robot, q, points)
+        touched = jnp.zeros(features.WAY * len(standing) + 4)
         each = jnp.zeros((lanes, candidates, 1))
         last = each * touched if config.kind == "discriminator" else jax.random.key(0)
         start = jnp.zeros((lanes, 1)) * own
@@ -134,20 +134,22 @@ def test_images_show_what_surrounds_the_start():
     assert context.SIDE == 40
 
 
-def test_clearances_are_read_where_the_robot_would_be():
+def test_surroundings_are_read_where_the_robot_would_pass():
     robot = load_robot("snake")
     image = jnp.arange(1600.0).reshape(40, 40, 1)
-    q = jnp.zeros((1, 8)).at[0, :2].set(jnp.array([0.45, -0.45]))  # straight along +y
-    points = jax.vmap(lambda q: link_features(robot, q))(q)
     goal = jnp.full(8, 0.45).at[2].set(2 * np.pi - 1)  # the first joint goes round
-    read = np.asarray(relations(robot, image, jnp.zeros(8), goal, q, points))[0]
-    cells = [(24, int(np.floor((-0.45 + 0.12 * k) / 0.1)) + 20) for k in range(1, 7)]
-    way = [
-        (20 + int(np.floor(4.5 * f)), 20 + int(np.floor(-4.5 * f))) for f in (0.25, 0.5, 0.75, 1)
-    ]
-    np.testing.assert_array_equal(read[:10], [40 * i + j for i, j in cells + way])
+    waypoint = jnp.zeros(8).at[:2].set(jnp.array([0.45, -0.45]))  # straight along +y, as the start
+    q = jnp.stack([jnp.zeros(8), goal, waypoint])
+    points = jax.vmap(lambda q: link_features(robot, q))(q)
+    read = np.asarray(relations(robot, image, q, points))[0]
+    cells = []
+    for fraction in (0.25, 0.5, 0.75, 1.0):
+        for along in (*(0.12 * np.arange(1, 7)), 0.0):
+            x, y = 0.45 * fraction, along - 0.45 * fraction
+            cells.append((20 + int(np.floor(x / 0.1)), 20 + int(np.floor(y / 0.1 + 1e-4))))
+    np.testing.assert_array_equal(read[:28], [40 * i + j for i, j in cells])
     arm = [np.sqrt(5 * 0.45**2 + (1.0 if robot.wraps[2] else 2 * np.pi - 1) ** 2)]
-    np.testing.assert_allclose(read[10:], [np.hypot(0.45, 0.45), 0, 0.9, *arm], atol=1e-4)
+    np.testing.assert_allclose(read[28:], [np.hypot(0.45, 0.45), 0, 0.9, *arm], atol=1e-4)
 
 
 def test_candidates_are_judged_one_by_one():

@@ -129,9 +129,10 @@ class RRTConnect:
             upper=jnp.minimum(world.upper, jnp.max(ends, axis=0) + self.margin),
         )
         key_near, key_far = jax.random.split(key)
+        aim_shape = (self.lanes, lower.shape[0])
         sample = jnp.where(
             (lane // 2 % 2 == 0)[:, None],
-            sample_configurations(near, key_near, self.lanes),
+            jax.random.uniform(key_near, aim_shape, minval=lower, maxval=upper),
             sample_configurations(world, key_far, self.lanes),
         )
         aim = jnp.where(connects[:, None], tree.q[chosen], sample)
