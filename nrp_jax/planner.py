@@ -171,8 +171,7 @@ def check_configuration(
             f"the {what}'s {robot.joint_names[joint]} is {q[joint]}; {place} "
             f"[{lower[joint]:.3f}, {upper[joint]:.3f}]"
         )
-    low, high = np.where(wraps, q, lower), np.where(wraps, q, upper)
-    inside = world.normalise(jnp.asarray(np.clip(q, low, high)))
+    inside = into_limits(world, jnp.asarray(q))
     if not batch_is_free(world, inside[None])[0]:
         raise ValueError(
             f"the {what} touches the map, the floor or the robot itself: {np.round(q, 3).tolist()};"

@@ -52,8 +52,8 @@ class Discriminator:
     candidates: int = static(default=500)
     along: float = static(default=0.5)  # share of candidates with a posture between the ends'
     judged: int = static(default=192)  # most that the network looks at
-    checked: int = static(default=4)  # of the best, the first whose edge seems free is taken
-    edge_checks: int = static(default=4)  # configurations looked at along each of these edges
+    checked: int = static(default=8)  # of the best, the first whose edge seems free is taken
+    edge_checks: int = static(default=6)  # configurations looked at along each of these edges
 
     def propose(
         self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
@@ -76,8 +76,13 @@ class Discriminator:
             _, kept = jax.lax.top_k(rank, self.judged)
             q, points, possible = jax.vmap(
                 lambda kept, arrays: jax.tree.map(lambda x: x[kept], arrays)
-            )(kept, (q, points, relation, possible))
-        module: Any = build_module(self.config, 0)
+            )(kept, (q, points, possible))
+        relation = jax.vmap(functools.partial(relations, self.robot))(
+            sight.image,
+            jnp.concatenate([sight.ends, q], axis=1),
+            jnp.concatenate([sight.end_points, points], axis=1),
+        )
+        module = build_module(self.config, 0)
         logits = module.apply(
             self.variables,
             sight.image,
@@ -125,8 +130,8 @@ class Generator:
     variables: Any
     config: ModelConfig = static()
     num_outputs: int = static()
-    draws: int = static(default=1)  # latents, of which the first whose edge seems free is taken
-    edge_checks: int = static(default=4)  # configurations looked at along each of these edges
+    draws: int = static(default=8)  # latents, of which the first whose edge seems free is taken
+    edge_checks: int = static(default=6)  # configurations looked at along each of these edges
 
     def propose(
         self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
@@ -134,7 +139,7 @@ class Generator:
         """See :class:`Sampler`."""
         sight = _look(self.config, self.robot, world, q_from, q_goal)
         z = jax.random.normal(key, (len(q_from), self.draws, self.config.latent))
-        module: Any = build_module(self.config, self.num_outputs)
+        module = build_module(self.config, self.num_outputs)
         made = module.apply(
             self.variables, sight.image, sight.start, sight.goal, z, method=CVAE.decode
         )

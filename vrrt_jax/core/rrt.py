@@ -1,7 +1,6 @@
 """RRT, RRT* and RRT-Connect to a joint goal, as policies of the kernel."""
 
 import dataclasses
-from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -123,11 +122,8 @@ class RRTConnect:
         # Half of the samples near the two ends: where limits are far apart, few others serve.
         q_start, q_goal = tree.q[:2]
         ends = jnp.stack([q_start, world.end(q_start, world.edge(q_start, q_goal))])
-        near: Space = dataclasses.replace(
-            cast(Any, world),
-            lower=jnp.maximum(world.lower, jnp.min(ends, axis=0) - self.margin),
-            upper=jnp.minimum(world.upper, jnp.max(ends, axis=0) + self.margin),
-        )
+        lower = jnp.maximum(world.lower, jnp.min(ends, axis=0) - self.margin)
+        upper = jnp.minimum(world.upper, jnp.max(ends, axis=0) + self.margin)
         key_near, key_far = jax.random.split(key)
         aim_shape = (self.lanes, lower.shape[0])
         sample = jnp.where(
