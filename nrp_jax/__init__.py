@@ -1,6 +1,7 @@
 """Neural randomized planning in JAX: learned samplers for long-horizon motion in homes."""
 
 from nrp_jax.grid import Grid, load_map
+from nrp_jax.planner import PlanResult, Status, plan
 from nrp_jax.robots import MobileRobot, link_features, load_robot
 from nrp_jax.world import GridWorld, batch_is_free, build_world, is_free, with_grid
 
@@ -8,11 +9,14 @@ __all__ = [
     "Grid",
     "GridWorld",
     "MobileRobot",
+    "PlanResult",
+    "Status",
     "batch_is_free",
     "build_world",
     "is_free",
     "link_features",
     "load_map",
     "load_robot",
+    "plan",
     "with_grid",
 ]

@@ -82,7 +82,7 @@ class Discriminator:
             jnp.concatenate([sight.ends, q], axis=1),
             jnp.concatenate([sight.end_points, points], axis=1),
         )
-        module = build_module(self.config, 0)
+        module: Any = build_module(self.config, 0)
         logits = module.apply(
             self.variables,
             sight.image,
@@ -139,7 +139,7 @@ class Generator:
         """See :class:`Sampler`."""
         sight = _look(self.config, self.robot, world, q_from, q_goal)
         z = jax.random.normal(key, (len(q_from), self.draws, self.config.latent))
-        module = build_module(self.config, self.num_outputs)
+        module: Any = build_module(self.config, self.num_outputs)
         made = module.apply(
             self.variables, sight.image, sight.start, sight.goal, z, method=CVAE.decode
         )
