@@ -154,11 +154,7 @@ def train(
 def init(config: ModelConfig, module: nn.Module, batch: Batch, key: jax.Array) -> dict[str, Any]:
     """Random variables of a module."""
     last = batch.relation if config.kind == "discriminator" else key
-<<<<<<< HEAD
-    return dict(module.init(key, batch.image, batch.start, batch.goal, batch.waypoints, last))
-=======
     return jax.jit(module.init)(key, batch.image, batch.start, batch.goal, batch.waypoints, last)
->>>>>>> nrp
 
 
 def loss_fn(

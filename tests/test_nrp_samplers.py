@@ -83,13 +83,8 @@ def test_checking_finds_waypoints_that_can_be_reached(models, world, ends):
 def test_a_goal_in_the_window_can_be_the_waypoint(models, world, ends):
     """Of no candidates but the goal, the goal is the best."""
     sampler = samplers.make_sampler(models["discriminator"], candidates=0)
-<<<<<<< HEAD
-    beside = jnp.minimum(ends[0][:, :2] + 0.5, world.upper[:2])
-    near = ends[1].at[:, :2].set(beside)
-=======
     inwards = 0.5 * jnp.sign(3.0 - ends[0][:, :2])
     near = ends[1].at[:, :2].set(ends[0][:, :2] + inwards)
->>>>>>> nrp
     q = samplers.propose(sampler, world, ends[0], near, jax.random.key(0))
     np.testing.assert_allclose(q, near, atol=1e-5)
 
