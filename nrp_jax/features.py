@@ -106,10 +106,12 @@ def passed_points(start: jax.Array, end: jax.Array) -> jax.Array:
 
 def cells(points: jax.Array, shape: tuple[int, ...], resolution: float) -> jax.Array:
     """Flat indices (...) of the cells of a window (X, Y, Z) that hold local points (..., 3)."""
-    middle = jnp.array([shape[0] // 2, shape[1] // 2, 0])
-    index = jnp.floor(points / resolution).astype(jnp.int32) + middle
-    index = jnp.clip(index, 0, jnp.array(shape) - 1)
-    return (index[..., 0] * shape[1] + index[..., 1]) * shape[2] + index[..., 2]
+    flat = jnp.int32(0)
+    for axis, middle in enumerate((shape[0] // 2, shape[1] // 2, 0)):
+        if shape[axis] > 1:  # axis by axis: XLA's CPU loops over a last axis of three are slow
+            index = jnp.floor(points[..., axis] * (1.0 / resolution)).astype(jnp.int32) + middle
+            flat = flat * shape[axis] + jnp.clip(index, 0, shape[axis] - 1)
+    return flat
 
 
 def steps(robot: MobileRobot, q: jax.Array, end: jax.Array) -> jax.Array:

@@ -248,7 +248,7 @@ def load_sampler(
 
 @jax.jit
 def propose(
-    sampler: Discriminator | Generator,
+    sampler: Sampler,
     world: GridWorld,
     q_from: jax.Array,
     q_goal: jax.Array,

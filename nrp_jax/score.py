@@ -71,7 +71,7 @@ def optimality(
     extents = Extents(robot, q)
     waiting = {}
     for k in np.flatnonzero(free):
-        near = np.flatnonzero(extents.inside(int(own[k]), slice(len(roadmap.q))))
+        near = np.flatnonzero(extents.inside(own[k], slice(len(roadmap.q))))
         total = _lengths(world, q, own[k], near) + queries.cost[queries.goal[k], near]
         order = np.argsort(total)
         waiting[int(k)] = (near[order], total[order])
