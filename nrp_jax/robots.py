@@ -13,7 +13,7 @@ from vrrt_jax.core.kinematics import Chain, chain_from_model, link_poses
 from vrrt_jax.core.types import Spheres, pytree, static
 
 FOOTPRINT = "footprint"  # geom of a round base that never tilts: a cylinder, not spheres
-_FILES = {"snake": "snake", "fetch": "fetch_mobile"}  # folders in scenes/robots
+_NAMES = ("snake", "fetch")  # files in scenes/mobile_robots
 # Half the side of the bricks that a sphere covers [m], on the base and on the links.
 _GRAIN = {"snake": (0.02, 0.0125), "fetch": (0.05, 0.05)}
 
@@ -92,9 +92,9 @@ def load_robot(name: str) -> MobileRobot:
     Raises:
         ValueError: the name is unknown.
     """
-    if name not in _FILES:
-        raise ValueError(f"unknown robot '{name}'; have: {', '.join(_FILES)}")
-    xml = (_scenes_dir() / "robots" / _FILES[name] / "robot.xml").read_text()
+    if name not in _NAMES:
+        raise ValueError(f"unknown robot '{name}'; have: {', '.join(_NAMES)}")
+    xml = (_scenes_dir() / "mobile_robots" / f"{name}.xml").read_text()
     model = mujoco.MjModel.from_xml_string(xml)
     chain, body_link, body_in_link = chain_from_model(model)
     planar = name == "snake"
