@@ -13,8 +13,6 @@ import numpy as np
 
 from nrp_jax.models import CVAE, Discriminator, ModelConfig
 
-SUFFIX = ".npz"
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Model:

@@ -2,24 +2,19 @@
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-EXIT_SOLVED, EXIT_UNSOLVED, EXIT_BAD_INPUT = 0, 1, 2
+from vrrt_jax.core import command
+from vrrt_jax.core.command import EXIT_SOLVED, EXIT_UNSOLVED
+
 _KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0 solved or done, 1 not solved, 2 bad input."""
-    arguments = _parser().parse_args(argv)
-    _use_compilation_cache()
-    try:
-        return arguments.run(arguments)
-    except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
-        print(f"nrp {arguments.command}: {error}", file=sys.stderr)
-        return EXIT_BAD_INPUT
+    return command.run(_parser(), argv)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -128,14 +123,3 @@ def _numbers(text: str) -> tuple[float, ...]:
         raise argparse.ArgumentTypeError(
             f"'{text}' is not a list of numbers such as 1,2.5,0"
         ) from None
-
-
-def _use_compilation_cache() -> None:
-    """Keep compiled programs between runs, unless the user has said where or not at all."""
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return
-    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    import jax
-
-    jax.config.update("jax_compilation_cache_dir", str(home / "nrp_jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)

@@ -19,7 +19,6 @@ from nrp_jax.world import GridWorld, batch_is_free, build_world, sample_configur
 EXPANSIONS = 300
 MIN_GEODESIC = 5.0  # of the base, from start to goal [m]
 GOAL_BIAS = 0.1
-ACCEPTED = (0.2, 0.6)
 _CAPACITY, _SUB_STEPS = 1 << 13, 160
 
 

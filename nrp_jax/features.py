@@ -11,6 +11,7 @@ import numpy as np
 from nrp_jax.field import FINE, Field
 from nrp_jax.models import ModelConfig
 from nrp_jax.robots import MobileRobot
+from vrrt_jax.core.edges import short_way
 
 FAR = 6.0  # goals farther than this look as if they were this far [m]
 CLEAR = 1.0  # distances to obstacles beyond this do not matter [m]
@@ -116,9 +117,7 @@ def cells(points: jax.Array, shape: tuple[int, ...], resolution: float) -> jax.A
 
 def steps(robot: MobileRobot, q: jax.Array, end: jax.Array) -> jax.Array:
     """How far base and arm are apart (..., 2) in configurations (..., D) and (D,) [m] and [rad]."""
-    step = q - end
-    step = step - 2 * jnp.pi * jnp.where(robot.wraps, jnp.round(step / (2 * jnp.pi)), 0.0)
-    squared = step**2
+    squared = short_way(q - end, robot.wraps) ** 2
     base, arm = squared[..., :2].sum(-1), squared[..., robot.base_dim :].sum(-1)
     return jnp.sqrt(jnp.stack([base, arm], axis=-1) + 1e-12)
 

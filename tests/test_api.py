@@ -2,6 +2,8 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
 import vrrt_jax
 
 ROOT = Path(__file__).parents[1]
@@ -44,9 +46,12 @@ def test_files_are_short():
         assert len(file.read_text().splitlines()) <= 560, file.name
 
 
-def test_the_readme_runs(tmp_path):
+@pytest.mark.parametrize("index", [0, 1])
+def test_the_readme_runs(index, tmp_path, monkeypatch):
     """The README's Python, as it stands there."""
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    codes = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert len(codes) == 2
+    monkeypatch.chdir(tmp_path)
     scope = {}
-    exec(compile(code, "README.md", "exec"), scope)
+    exec(compile(codes[index], "README.md", "exec"), scope)
     assert scope["result"].ok

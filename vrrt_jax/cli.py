@@ -2,25 +2,19 @@
 
 import argparse
 import json
-import os
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-EXIT_SOLVED, EXIT_UNSOLVED, EXIT_BAD_INPUT = 0, 1, 2
+from vrrt_jax.core import command
+from vrrt_jax.core.command import EXIT_SOLVED, EXIT_UNSOLVED
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0 solved or done, 1 not solved, 2 bad input."""
-    arguments = _parser().parse_args(argv)
-    _use_compilation_cache()
-    try:
-        return arguments.run(arguments)
-    except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
-        print(f"vrrt {arguments.command}: {error}", file=sys.stderr)
-        return EXIT_BAD_INPUT
+    return command.run(_parser(), argv)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -369,17 +363,6 @@ def _writable(folder: str | Path) -> Path:
             f"cannot write to the folder '{folder}': {error.strerror}; choose another with --out"
         ) from None
     return folder
-
-
-def _use_compilation_cache() -> None:
-    """Keep compiled programs between runs, unless the user has said where or not at all."""
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return
-    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    import jax
-
-    jax.config.update("jax_compilation_cache_dir", str(home / "vrrt_jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
 def _numbers(text: str):

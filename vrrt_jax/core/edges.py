@@ -128,16 +128,18 @@ class Straight:
 
 def joint_steps(space: Straight, nodes: jax.Array, q: jax.Array, joint: int) -> jax.Array:
     """Steps (B, N) of one joint from ``q`` (B, D) to ``nodes`` (N, D)."""
-    step = nodes[:, joint] - q[:, joint, None]
-    turns = jnp.where(space.wraps[joint], jnp.round(step / (2 * jnp.pi)), 0.0)
+    return short_way(nodes[:, joint] - q[:, joint, None], space.wraps[joint])
+
+
+def short_way(step: jax.Array, wraps: jax.Array) -> jax.Array:
+    """The same steps (...), of joints that wrap the short way round."""
+    turns = jnp.where(wraps, jnp.round(step / (2 * jnp.pi)), 0.0)
     return step - 2 * jnp.pi * turns
 
 
 def difference(world: Straight, q_from: jax.Array, q_to: jax.Array) -> jax.Array:
     """The step (..., D) from one configuration to another, the short way round."""
-    step = q_to - q_from
-    turns = jnp.where(world.wraps, jnp.round(step / (2 * jnp.pi)), 0.0)
-    return step - 2 * jnp.pi * turns
+    return short_way(q_to - q_from, world.wraps)
 
 
 def distance(world: Space, q_a: jax.Array, q_b: jax.Array) -> jax.Array:

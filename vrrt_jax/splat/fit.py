@@ -258,7 +258,7 @@ def initial_splats(points: np.ndarray, num_splats: int, seed: int) -> SplatModel
     rng = np.random.default_rng(seed)
     links, counts = np.unique(points[:, 0].astype(int), return_counts=True)
     # The square root keeps small but telling links, such as fingers, from starving.
-    shares = np.sqrt(counts)  # small links tell more of the pose than their pixels do
+    shares = np.sqrt(counts)
     quota = np.maximum(8, np.floor(shares / shares.sum() * num_splats)).astype(int)
     quota[np.argmax(quota)] += num_splats - quota.sum()
     mean, radius, rgb, link = [], [], [], []

@@ -1,0 +1,35 @@
+"""What the command lines share: exit codes, errors in one line, the cache of compiled programs."""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+EXIT_SOLVED, EXIT_UNSOLVED, EXIT_BAD_INPUT = 0, 1, 2
+
+
+def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> int:
+    """Run what the chosen sub-command has set as ``run``; bad input becomes one line.
+
+    Returns:
+        The exit code: 0 solved or done, 1 not solved, 2 bad input.
+    """
+    arguments = parser.parse_args(argv)
+    _use_compilation_cache(parser.prog)
+    try:
+        return arguments.run(arguments)
+    except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
+        print(f"{parser.prog} {arguments.command}: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+
+
+def _use_compilation_cache(name: str) -> None:
+    """Keep compiled programs between runs, unless the user has said where or not at all."""
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", str(home / f"{name}_jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
