@@ -20,7 +20,7 @@ import numpy as np
 from nrp_jax import houses
 from nrp_jax.grid import Grid
 
-VERSION = 2  # of the rows
+VERSION = 3  # of the rows
 MANIFEST = "manifest.json"
 ROWS = ("q_start", "q_goal", "waypoint", "optimal", "ratio", "length", "query")
 FIRST_TEST_SEED = 1_000_000  # homes for tests have seeds from here on, those for training below
@@ -144,12 +144,13 @@ def make_shard(settings: Settings, split: str, index: int, path: Path) -> dict[s
     import jax
 
     from nrp_jax import expert
+    from nrp_jax.difficulty import fair_house
     from nrp_jax.robots import load_robot
     from nrp_jax.world import build_world
 
     seed = home_seed(settings, split, index)
-    house = houses.generate_house(seed, settings.task)
     robot = load_robot(settings.task)
+    house = fair_house(robot, seed)
     world = build_world(robot, house.grid)
     roadmap = expert.build_roadmap(world, robot, jax.random.key(seed), settings.nodes)
     rows = expert.make_rows(

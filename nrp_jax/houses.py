@@ -23,6 +23,7 @@ BODY = {"snake": 1.0, "fetch": 1.5}  # height that a robot's base and trunk meet
 SPREAD = 4  # cells that placing furniture keeps free around the base
 ERODE = 0.3  # [m] around the base where the free space must be connected
 MIN_ROOMS = 4
+_ATTEMPTS = 100
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,25 +42,28 @@ class House:
         return self.grid.flatten(0.0, 1.0)
 
 
-def generate_house(seed: int, kind: str = "snake", clutter: float = 1.0) -> House:
+def generate_house(
+    seed: int, kind: str = "snake", clutter: float = 1.0, variant: int = 0
+) -> House:
     """Make a home.
 
     Args:
-        seed: the same seed, kind and clutter give the same home.
+        seed: the same seed, kind, clutter and variant give the same home.
         kind: "snake" for 10 x 10 m, "fetch" for 12 to 15 m in a grid of 15 m.
         clutter: multiple of the usual amount of furniture beyond what each room needs.
+        variant: another home for the same seed, see :func:`nrp_jax.difficulty.fair_house`.
 
     Raises:
         ValueError: the kind is unknown.
     """
     if kind not in CELLS:
         raise ValueError(f"unknown kind of home '{kind}'; have: {', '.join(CELLS)}")
-    for attempt in range(100):
+    for attempt in range(_ATTEMPTS * variant, _ATTEMPTS * (variant + 1)):
         rng = np.random.default_rng([VERSION, seed, attempt, CELLS[kind]])
         house = _attempt(rng, seed, kind, clutter)
         if house and len(house.rooms) >= MIN_ROOMS and is_connected(house.grid, kind):
             return house
-    raise RuntimeError(f"no home came out of seed {seed} in 100 attempts; take another seed")
+    raise RuntimeError(f"no home came out of seed {seed} in {_ATTEMPTS} attempts; take another seed")
 
 
 def is_connected(grid: Grid, kind: str) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nrp_jax import build_world, houses, load_robot
-from nrp_jax.difficulty import difficulty, long_queries, rrt_is
+from nrp_jax.difficulty import FAIR, difficulty, fair_house, long_queries, rrt_is
 from nrp_jax.furniture import HEIGHT, MAKERS
 from nrp_jax.grid import Grid, load_map
 
@@ -171,3 +171,12 @@ def test_difficulty_of_an_empty_room_and_of_a_closed_one():
     assert not rrt_is(world, starts[0], across, jax.random.key(0))
     with pytest.raises(ValueError, match="too small"):
         difficulty(robot, empty_room(40), num=2)
+
+
+def test_a_home_that_is_too_hard_is_replaced():
+    robot = load_robot("snake")
+    first, taken = houses.generate_house(2), fair_house(robot, 2)
+    low, high = FAIR
+    assert not low <= difficulty(robot, first.plan()) <= high
+    assert low <= difficulty(robot, taken.plan()) <= high
+    assert fair_house(load_robot("fetch"), 2).seed == 2

@@ -17,7 +17,7 @@ from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import Rejection, Status
 from vrrt_jax.core.verify import verify_path
 from vrrt_jax.core.world import World, obstacle_list
-from vrrt_jax.polish import DISTINCT, LANES, Polishing, look_at, polish
+from vrrt_jax.polish import DISTINCT, GLANCES, LANES, Polishing, glance, look_at, polish
 from vrrt_jax.robots.robot import Robot
 
 STATUS_OF = {
@@ -137,8 +137,10 @@ def _polished(
     found: SearchResult, world: World, polishing: Polishing, q: np.ndarray, key: jax.Array
 ) -> tuple[SearchResult, tuple[np.ndarray, np.ndarray]]:
     """What :func:`polish` returns; its time is added to the search's."""
-    block = np.resize(q, (LANES, q.shape[1]))
-    _, compile_s, _ = timed(look_at, world, polishing.closer, block)
+    compile_s = sum(
+        timed(look, world, polishing.closer, np.resize(q, (lanes, q.shape[1])))[1]
+        for look, lanes in ((glance, GLANCES), (look_at, LANES))
+    )
     started = time.perf_counter()
     result = polish(world, polishing, q, int(jax.random.bits(key, dtype=jnp.uint32)))
     search_s = found.search_s + time.perf_counter() - started

@@ -8,6 +8,7 @@ bare flange, stays near the start: a weak prior sees to that.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -21,7 +22,8 @@ from vrrt_jax.splat.loss import weighted_goal, weighted_image
 from vrrt_jax.splat.raster import map_lanes
 from vrrt_jax.visual import VisualPolicy
 
-LANES = 8  # configurations looked at in one call
+LANES = 8  # configurations looked at in one call, and that descend
+GLANCES = 32  # configurations whose cost alone is asked for, in one call
 PROBE = 0.01  # [rad] step of the finite differences
 OTHERS = 0.5  # standard deviations that samples spread along all but the weakest direction
 RIDGE = 1e-7  # keeps joints that no pixel sees where they are
@@ -75,8 +77,9 @@ def polish(
     rng = np.random.default_rng(seed)
     kept = _look(world, polishing, q)
     for k in range(polishing.rounds):
-        samples = _look(world, polishing, _spread(kept, polishing, polishing.slack / 3.0**k, rng))
-        best = _rows(samples, np.argsort(samples.cost, kind="stable")[:LANES])
+        samples = _spread(kept, polishing, polishing.slack / 3.0**k, rng)
+        cost = _in_blocks(glance, world, polishing, samples, GLANCES)[0]
+        best = _look(world, polishing, samples[np.argsort(cost, kind="stable")[:LANES]])
         best = _descend(world, polishing, best, polishing.steps)
         kept = _rows(best, _distinct(best, polishing.kept))
     kept = _rows(kept, np.argsort(np.where(kept.free, kept.cost, np.inf), kind="stable"))
@@ -134,11 +137,27 @@ def _descend(world: World, polishing: Polishing, now: _Look, steps: int) -> _Loo
 
 
 def _look(world: World, polishing: Polishing, q: np.ndarray) -> _Look:
-    """Look at configurations (n, D), a few at a time: one program serves any number."""
-    blocks = -(-len(q) // LANES)
-    padded = np.resize(q, (blocks * LANES, q.shape[1])).astype(np.float32)
-    seen = [jax.device_get(look_at(world, polishing.closer, b)) for b in np.split(padded, blocks)]
-    return _Look(*(np.concatenate(column)[: len(q)] for column in zip(*seen, strict=True)))
+    """Look at configurations (n, D)."""
+    return _Look(*_in_blocks(look_at, world, polishing, q, LANES))
+
+
+def _in_blocks(
+    function: Callable, world: World, polishing: Polishing, q: np.ndarray, size: int
+) -> list[np.ndarray]:
+    """Arrays (n, ...) about configurations (n, D), a few at a time: one program serves any n."""
+    blocks = -(-len(q) // size)
+    padded = np.resize(q, (blocks * size, q.shape[1])).astype(np.float32)
+    seen = [function(world, polishing.closer, block) for block in np.split(padded, blocks)]
+    return [np.concatenate(column)[: len(q)] for column in zip(*jax.device_get(seen), strict=True)]
+
+
+@jax.jit
+def glance(world: World, closer: Closer, q: jax.Array) -> tuple[jax.Array]:
+    """The cost alone (n,), see :class:`_Look`."""
+    q = into_limits(world, q)
+    loss = map_lanes(lambda q: closer.policy.loss(world, q), q)
+    away = difference(world, closer.q_start, q)
+    return (loss + closer.prior * jnp.sum(away**2, axis=1),)
 
 
 @jax.jit
