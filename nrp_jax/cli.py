@@ -9,8 +9,6 @@ from pathlib import Path
 from vrrt_jax.core import command
 from vrrt_jax.core.command import EXIT_SOLVED, EXIT_UNSOLVED
 
-_KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae"}
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0 solved or done, 1 not solved, 2 bad input."""
@@ -19,7 +17,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     from nrp_jax import data, houses, score, train
-    from nrp_jax.bench import checks
+    from nrp_jax.bench import checks, planning
 
     parser = argparse.ArgumentParser(
         prog="nrp", description="Motion planning in homes, with learned samplers."
@@ -28,8 +26,10 @@ def _parser() -> argparse.ArgumentParser:
     for module in (houses, data, train, score):
         module.add_arguments(commands)
     _add_plan(commands)
-    bench = commands.add_parser("bench", help="measure speed")
-    checks.add_arguments(bench.add_subparsers(dest="what", required=True))
+    bench = commands.add_parser("bench", help="measure speed and success")
+    benches = bench.add_subparsers(dest="what", required=True)
+    for module in (checks, planning):
+        module.add_arguments(benches)
     return parser
 
 
@@ -56,7 +56,7 @@ def _plan(arguments: argparse.Namespace) -> int:
     import jax
 
     from nrp_jax.grid import load_map
-    from nrp_jax.planner import plan
+    from nrp_jax.planner import KINDS, plan
     from nrp_jax.robots import load_robot
     from nrp_jax.world import build_world
 
@@ -66,10 +66,10 @@ def _plan(arguments: argparse.Namespace) -> int:
             raise ValueError(f"--crop has {len(arguments.crop)} numbers; expected x0,y0,x1,y1")
         grid = grid.crop(arguments.crop[:2], arguments.crop[2:])
     sampler = None
-    if arguments.method in _KINDS:
+    if arguments.method in KINDS:
         from nrp_jax.samplers import load_sampler
 
-        sampler = load_sampler(robot.name, _KINDS[arguments.method], arguments.model)
+        sampler = load_sampler(robot.name, KINDS[arguments.method], arguments.model)
     world = build_world(robot, grid, resolution=arguments.resolution)
     result = plan(
         robot,

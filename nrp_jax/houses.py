@@ -42,9 +42,7 @@ class House:
         return self.grid.flatten(0.0, 1.0)
 
 
-def generate_house(
-    seed: int, kind: str = "snake", clutter: float = 1.0, variant: int = 0
-) -> House:
+def generate_house(seed: int, kind: str = "snake", clutter: float = 1.0, variant: int = 0) -> House:
     """Make a home.
 
     Args:
@@ -63,7 +61,9 @@ def generate_house(
         house = _attempt(rng, seed, kind, clutter)
         if house and len(house.rooms) >= MIN_ROOMS and is_connected(house.grid, kind):
             return house
-    raise RuntimeError(f"no home came out of seed {seed} in {_ATTEMPTS} attempts; take another seed")
+    raise RuntimeError(
+        f"no home came out of seed {seed} in {_ATTEMPTS} attempts; take another seed"
+    )
 
 
 def is_connected(grid: Grid, kind: str) -> bool:

@@ -23,6 +23,7 @@ from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import Rejection, Tree
 
 METHODS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g")
+KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae"}  # of the samplers that methods need
 ARRIVED = 1e-4  # from the goal, which a node either is or is not
 ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
 

@@ -203,16 +203,27 @@ def _postures(
 def _first_free(world: GridWorld, q_from: jax.Array, q: jax.Array, num_checks: int) -> jax.Array:
     """Of waypoints (B, K, D), best first, the first (B, D) whose edge seems free, or else the best.
 
-    Looks at ``num_checks`` configurations of each edge, the waypoint the last of them.
+    Looks at ``num_checks`` configurations of each edge, the waypoint the last of them. B edges are
+    looked at in a round, of lanes that have found none; most lanes are done after the first.
     """
-    lanes, many = q.shape[:2]
+    lanes, many, joints = q.shape
     if many == 1:
         return q[:, 0]
-    repeated = jnp.repeat(q_from, many, axis=0)
-    edge = world.edge(repeated, q.reshape(-1, q.shape[-1]))
-    points = points_along(world, repeated, edge, num_checks)
-    free = jax.vmap(world.is_free)(points.reshape(-1, q.shape[-1]))
-    free = jnp.all(free.reshape(lanes, many, num_checks), axis=2)
+    turn = jnp.arange(many)[None] * lanes + jnp.arange(lanes)[:, None]  # who is next
+
+    def look(state):
+        pending, free = state
+        _, index = jax.lax.top_k(-jnp.where(pending, turn, many * lanes).reshape(-1), lanes)
+        lane = index // many
+        edge = world.edge(q_from[lane], q.reshape(-1, joints)[index])
+        points = points_along(world, q_from[lane], edge, num_checks)
+        ok = jax.vmap(world.is_free)(points.reshape(-1, joints)).reshape(lanes, num_checks)
+        free = free.at[lane, index % many].max(jnp.all(ok, axis=1))
+        pending = pending.at[lane, index % many].set(False)
+        return pending & ~jnp.any(free, axis=1, keepdims=True), free
+
+    untried = jnp.ones((lanes, many), bool)
+    _, free = jax.lax.while_loop(lambda s: jnp.any(s[0]), look, (untried, ~untried))
     return jnp.take_along_axis(q, jnp.argmax(free, axis=1)[:, None, None], axis=1)[:, 0]
 
 

@@ -1,0 +1,156 @@
+"""How often do planners find a way across unseen homes within some expansions?"""
+
+import argparse
+import dataclasses
+import json
+import platform
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from nrp_jax.data import Settings, home_seed
+from nrp_jax.difficulty import EXPANSIONS, MIN_GEODESIC, fair_house, long_queries
+from nrp_jax.exact import ExactScene
+from nrp_jax.houses import CELLS
+from nrp_jax.planner import KINDS, METHODS, PlanResult, plan
+from nrp_jax.robots import MobileRobot, load_robot
+from nrp_jax.world import GridWorld, build_world
+
+
+@dataclasses.dataclass(frozen=True)
+class Home:
+    """A home with the queries asked in it."""
+
+    seed: int
+    world: GridWorld
+    scene: ExactScene
+    starts: np.ndarray  # (n, D)
+    goals: np.ndarray  # (n, D)
+    grid: Any
+
+
+def unseen_homes(robot: MobileRobot, homes: int, queries: int, seed: int) -> list[Home]:
+    """The test homes of a data set with this seed, with long queries of a home each."""
+    found = []
+    for index in range(homes):
+        own = home_seed(Settings(task=robot.name, seed=seed), "test", index)
+        house = fair_house(robot, own)
+        grid = house.plan() if robot.planar else house.grid
+        world = build_world(robot, grid)
+        starts, goals = long_queries(robot, world, grid, queries, own)
+        found.append(Home(own, world, ExactScene(robot, grid), starts, goals, grid))
+    return found
+
+
+def run(
+    robot: MobileRobot,
+    homes: Sequence[Home],
+    method: str,
+    sampler: Any,
+    *,
+    max_expansions: int,
+    lanes: int,
+    goal_bias: float,
+    on_result: Callable[[PlanResult], Any] = lambda result: None,
+) -> dict[str, Any]:
+    """Solve all queries by one method, each path checked with C MuJoCo.
+
+    Returns:
+        ``n``, ``success`` (share), ``median_search_s``, ``median_expansions`` and ``mean_cost_m``
+        (of those solved), ``not_verified`` (paths that C MuJoCo refuses).
+    """
+    results = []
+    for home in homes:
+        for index, (start, goal) in enumerate(zip(home.starts, home.goals, strict=True)):
+            results.append(
+                plan(
+                    robot,
+                    home.grid,
+                    start,
+                    goal,
+                    key=jax.random.key(home.seed + index),
+                    method=method,
+                    sampler=sampler,
+                    world=home.world,
+                    scene=home.scene,
+                    goal_bias=goal_bias,
+                    max_expansions=max_expansions,
+                    lanes=lanes,
+                )
+            )
+            on_result(results[-1])
+    solved = [result for result in results if result.ok]
+    return {
+        "n": len(results),
+        "success": round(len(solved) / len(results), 4),
+        "median_search_s": round(float(np.median([r.timing["search_s"] for r in results])), 4),
+        "median_expansions": float(np.median([r.expansions for r in solved])) if solved else None,
+        "mean_cost_m": round(float(np.mean([r.cost for r in solved])), 3) if solved else None,
+        "not_verified": sum(r.status.name == "NOT_VERIFIED" for r in results),
+    }
+
+
+def add_arguments(subparsers: Any) -> None:
+    """Add ``plan`` to the bench command."""
+    parser = subparsers.add_parser("plan", help="success on unseen homes at some expansions")
+    parser.set_defaults(run=_run_command)
+    parser.add_argument("--task", default="snake", choices=tuple(CELLS))
+    parser.add_argument("--methods", default=",".join(METHODS), help="some of the default's")
+    parser.add_argument("--homes", type=int, default=5)
+    parser.add_argument("--queries", type=int, default=10, help="of a home")
+    parser.add_argument("--max-expansions", type=int, default=EXPANSIONS)
+    parser.add_argument("--lanes", type=int, default=10, help="expansions at a time")
+    parser.add_argument("--goal-bias", type=float, default=0.1)
+    parser.add_argument("--discriminator", help="what nrp train wrote; packaged by default")
+    parser.add_argument("--cvae", help="what nrp train wrote; packaged by default")
+    parser.add_argument("--seed", type=int, default=0, help="of the homes, as for nrp data")
+    parser.add_argument("--json", help="write the figures here")
+
+
+def _run_command(arguments: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from nrp_jax.samplers import load_sampler
+
+    methods = arguments.methods.split(",")
+    unknown = [method for method in methods if method not in METHODS]
+    if unknown:
+        raise ValueError(f"unknown method '{unknown[0]}'; have: {', '.join(METHODS)}")
+    for name in ("homes", "queries", "max_expansions", "lanes"):
+        if getattr(arguments, name) < 1:
+            raise ValueError(f"{name} is {getattr(arguments, name)}; expected at least 1")
+    robot = load_robot(arguments.task)
+    samplers = {
+        method: load_sampler(robot.name, KINDS[method], getattr(arguments, KINDS[method]))
+        for method in methods
+        if method in KINDS
+    }
+    homes = unseen_homes(robot, arguments.homes, arguments.queries, arguments.seed)
+    budget = {name: getattr(arguments, name) for name in ("max_expansions", "lanes", "goal_bias")}
+    figures = {}
+    for method in methods:
+        with tqdm(total=len(homes) * arguments.queries, desc=method, unit="plan") as bar:
+            figures[method] = run(
+                robot,
+                homes,
+                method,
+                samplers.get(method),
+                **budget,
+                on_result=lambda _, bar=bar: bar.update(),
+            )
+        print(f"{method}: {json.dumps(figures[method])}", flush=True)
+    report = {
+        "task": robot.name,
+        "seed": arguments.seed,
+        "homes": [home.seed for home in homes],
+        "min_geodesic_m": MIN_GEODESIC,
+        **budget,
+        "methods": figures,
+        "machine": {"platform": platform.platform(), "device": str(jax.devices()[0])},
+    }
+    if arguments.json:
+        Path(arguments.json).write_text(json.dumps(report, indent=1) + "\n")
+    return 0
