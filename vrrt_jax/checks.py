@@ -40,6 +40,7 @@ RANGES = {
     "probe_px": (8, 4096),
     "hypotheses": (0, 1024),
     "attempts": (1, 1024),
+    "probe_rounds": (0, 1024),
     "polish_lanes": (3, 1024),
     "polish_px": (8, 4096),
     "polish_rounds": (1, 1024),

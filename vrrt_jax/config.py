@@ -28,9 +28,10 @@ class PlannerConfig:
     match_scale: float = 1.0  # the goal loss, in units of the self-model's calibrated bar
     probes: int = 1024  # renders around the start that seed the search (re-compiles)
     probe_radius: float = 2.8  # how far from it [rad]
+    probe_rounds: int = 4  # of looking for something better around each one kept
     probe_alpha: float = 0.06  # first of these steps, falling to zero [rad]
     probe_steps: int = 60  # Adam steps that the kept ones take at that resolution
-    probes_kept: int = 64  # best of them, which take those steps and become roots (re-compiles)
+    probes_kept: int = 64  # best of them, which improve and become roots (re-compiles)
     probe_px: int = 32  # image height that they are rendered at (re-compiles)
     hypotheses: int = 4  # matches that are polished on a larger image; 0 = none
     polish_lanes: int = 8  # samples of each, along what the image leaves open

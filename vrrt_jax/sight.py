@@ -114,6 +114,7 @@ def visual_probing(sight: Sight, policy: VisualPolicy, config: PlannerConfig) ->
     return Probing(
         policy=coarse,
         radius=jnp.float32(config.probe_radius),
+        rounds=jnp.int32(config.probe_rounds),
         steps=jnp.int32(config.probe_steps),
         num=config.probes,
         kept=min(config.probes, config.probes_kept),

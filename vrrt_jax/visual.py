@@ -20,6 +20,8 @@ from vrrt_jax.splat.loss import goal_loss
 from vrrt_jax.splat.raster import Windows, map_lanes
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
 
+CHILDREN = 16  # of a probe, in a generation
+SPREAD_FIRST, SPREAD_LAST = 0.8, 0.2  # [rad] standard deviations of their joints
 MAX_RANK = 1024  # best nodes that the frontier's law ranks; its weight there is below 1e-40
 
 
@@ -180,6 +182,7 @@ class Probing:
 
     policy: VisualPolicy  # with the coarse goal; only its loss is used
     radius: jax.Array  # () largest distance from the start [rad]
+    rounds: jax.Array  # () i32 times that each kept one looks for something better around it
     steps: jax.Array  # () i32 Adam steps that each kept one takes
     num: int = static()  # configurations rendered; none gives the plain tree of the paper
     kept: int = static()  # best of them that descend; all but the last become roots
@@ -220,15 +223,50 @@ def plant(
 
 def _best_probes(world: World, probing: Probing, q_start: jax.Array, key: jax.Array) -> jax.Array:
     """Configurations (kept, D) around the start that are free and render most like the goal."""
-    key_direction, key_distance = jax.random.split(key)
+    key_direction, key_distance, key_children = jax.random.split(key, 3)
     direction = jax.random.normal(key_direction, (probing.num, len(q_start)))
     direction /= jnp.linalg.norm(direction, axis=1, keepdims=True)
     distance = probing.radius * jax.random.uniform(key_distance, (probing.num, 1))
     q = into_limits(world, q_start + distance * direction)
-    loss = map_lanes(lambda q: probing.policy.loss(world, q), q)
-    loss = jnp.where(jax.vmap(is_free, (None, 0))(world, q), loss, jnp.inf)
+    loss = _probe(world, probing, q)
     _, best = jax.lax.top_k(-loss, probing.kept)
-    return _descend(world, probing, q[best])
+    return _descend(world, probing, _evolve(world, probing, q[best], loss[best], key_children))
+
+
+def _probe(world: World, probing: Probing, q: jax.Array) -> jax.Array:
+    """Losses (n,) on the small image, infinite in collision."""
+    loss = map_lanes(lambda q: probing.policy.loss(world, q), q)
+    return jnp.where(jax.vmap(is_free, (None, 0))(world, q), loss, jnp.inf)
+
+
+def _evolve(
+    world: World, probing: Probing, q: jax.Array, loss: jax.Array, key: jax.Array
+) -> jax.Array:
+    """Probes (kept, D), each replaced by the best of its children while that is better.
+
+    Children differ in some of the joints, by ever less. Where gradients end in the nearest local
+    minimum, they jump out of it; and as none competes with another's children, they stay diverse.
+    """
+    num, joints = q.shape
+    shape = (num, CHILDREN, joints)
+
+    def generation(k, state):
+        q, loss = state
+        key_step, key_share, key_moved = jax.random.split(jax.random.fold_in(key, k), 3)
+        past = k / jnp.maximum(probing.rounds - 1, 1)
+        spread = SPREAD_FIRST * (SPREAD_LAST / SPREAD_FIRST) ** past
+        share = jax.random.uniform(key_share, (*shape[:2], 1), minval=0.2)
+        moved = jax.random.uniform(key_moved, shape) < share
+        step = spread * moved * jax.random.normal(key_step, shape)
+        children = into_limits(world, (q[:, None] + step).reshape(-1, joints))
+        losses = _probe(world, probing, children).reshape(num, CHILDREN)
+        best = jnp.argmin(losses, axis=1)
+        lowest = jnp.min(losses, axis=1)
+        child = children.reshape(shape)[jnp.arange(num), best]
+        better = lowest < loss
+        return jnp.where(better[:, None], child, q), jnp.where(better, lowest, loss)
+
+    return jax.lax.fori_loop(0, probing.rounds, generation, (q, loss))[0]
 
 
 def _descend(world: World, probing: Probing, q: jax.Array) -> jax.Array:

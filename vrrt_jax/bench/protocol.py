@@ -22,6 +22,7 @@ ABLATIONS = {
     },
     "default": {
         "probes": (1024, 256, 0),
+        "probe_rounds": (0,),
         "probe_steps": (0,),
         "hypotheses": (0, 1),
         "polish_rounds": (1,),
