@@ -17,7 +17,7 @@ from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import Rejection, Status
 from vrrt_jax.core.verify import verify_path
 from vrrt_jax.core.world import World, obstacle_list
-from vrrt_jax.polish import DISTINCT, GLANCES, LANES, Polishing, glance, look_at, polish
+from vrrt_jax.polish import DISTINCT, GLANCES, LANES, Polishing, apart, glance, look_at, polish
 from vrrt_jax.robots.robot import Robot
 
 STATUS_OF = {
@@ -60,7 +60,7 @@ def finish_visual(
         goal_loss = polishing.goal_loss
         nodes = list(_distinct(world, score, q, q_start, config.hypotheses, np.inf))
         found, (q, score) = _polished(found, world, polishing, q[nodes], key)
-        far = _apart(world, q, q_start) ** 2  # of two that look alike, the nearer is likelier
+        far = apart(world, q, q_start) ** 2  # of two that look alike, the nearer is likelier
         order = np.argsort(score * (1.0 + config.start_preference * far), kind="stable")
         ends = [int(k) for k in order if np.isfinite(score[k])] or [0]
         paths, rivals = {}, ends
@@ -100,16 +100,9 @@ def _distinct(
             return
         # Nodes just under the bar would be nearer still, but only as they are not there yet.
         equal = open_nodes[score[open_nodes] <= SAME_LOSS * score[open_nodes].min()]
-        best = int(equal[np.argmin(_apart(world, q[equal], q_start))])
+        best = int(equal[np.argmin(apart(world, q[equal], q_start))])
         yield best
-        open_nodes = open_nodes[_apart(world, q[open_nodes], q[best]) > DISTINCT]
-
-
-def _apart(world: World, q: np.ndarray, q_other: np.ndarray) -> np.ndarray:
-    """Distances (n,) of configurations (n, D) from another (D,), the short way round."""
-    step = q - q_other
-    turns = np.round(step / (2 * np.pi)) * np.asarray(world.wraps)
-    return np.linalg.norm(step - 2 * np.pi * turns, axis=1)
+        open_nodes = open_nodes[apart(world, q[open_nodes], q[best]) > DISTINCT]
 
 
 def _connected(

@@ -81,7 +81,7 @@ def polish(
         cost = _in_blocks(glance, world, polishing, samples, GLANCES)[0]
         best = _look(world, polishing, samples[np.argsort(cost, kind="stable")[:LANES]])
         best = _descend(world, polishing, best, polishing.steps)
-        kept = _rows(best, _distinct(best, polishing.kept))
+        kept = _rows(best, _distinct(world, best, polishing.kept))
     kept = _rows(kept, np.argsort(np.where(kept.free, kept.cost, np.inf), kind="stable"))
     return kept.q, np.where(kept.free, kept.loss, np.inf)
 
@@ -90,13 +90,20 @@ def _rows(look: _Look, rows: np.ndarray) -> _Look:
     return _Look(*(column[rows] for column in look))
 
 
-def _distinct(look: _Look, num: int) -> np.ndarray:
+def _distinct(world: World, look: _Look, num: int) -> np.ndarray:
     """Rows (at most num,) by rising cost, of those that are near each other only the first."""
     kept: list[int] = []
     for k in np.argsort(look.cost, kind="stable"):
-        if np.all(np.linalg.norm(look.q[kept] - look.q[k], axis=1) > DISTINCT):
+        if np.all(apart(world, look.q[kept], look.q[k]) > DISTINCT):
             kept.append(k)
     return np.array(kept[:num])
+
+
+def apart(world: World, q: np.ndarray, q_other: np.ndarray) -> np.ndarray:
+    """Distances (n,) of configurations (n, D) from another (D,), the short way round."""
+    step = q - q_other
+    turns = np.round(step / (2 * np.pi)) * np.asarray(world.wraps)
+    return np.linalg.norm(step - 2 * np.pi * turns, axis=1)
 
 
 def _spread(
@@ -109,10 +116,9 @@ def _spread(
     along = OTHERS * rng.normal(size=(len(near.q), num, joints))
     along[:, :, 0] = np.linspace(-1.0, 1.0, num)
     samples = near.q[:, None] + np.einsum("hij,hlj->hli", vectors, reach[:, None] * along)
-    # Grippers look alike after half a turn.
-    weakest = vectors[:, :, 0]
-    turn = np.where(np.sum(near.q * weakest, axis=1, keepdims=True) > 0, -np.pi, np.pi)
-    turned = near.q + turn * weakest
+    # Grippers look alike after half a turn of the last joint.
+    turned = near.q.copy()
+    turned[:, -1] += np.where(near.q[:, -1] > 0, -np.pi, np.pi)
     return np.concatenate([near.q[:, None], turned[:, None], samples], axis=1).reshape(-1, joints)
 
 
