@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import nrp_jax
+from nrp_jax.bench import planning
 from nrp_jax.cli import main
 from nrp_jax.exact import ExactScene, verify
 from nrp_jax.grid import make_grid
@@ -191,3 +192,22 @@ def test_command_line(tmp_path, home, capsys):
     assert (out / "plan.png").stat().st_size > 10_000
     assert main([*command, "--start=1,2"]) == 2
     assert "the start has shape" in capsys.readouterr().err
+
+
+def test_bench_counts_verified_plans(snake, home, scene, tmp_path, monkeypatch, capsys):
+    world = nrp_jax.build_world(snake, home)
+    ends = np.stack([START, GOAL])
+    asked = planning.Home(
+        seed=0, grid=home, world=world, scene=scene, starts=ends, goals=ends[::-1]
+    )
+    monkeypatch.setattr(planning, "unseen_homes", lambda *_: [asked])
+    out = tmp_path / "plan.json"
+    command = ["bench", "plan", "--homes", "1", "--queries", "2", "--json", str(out)]
+    assert main([*command, "--methods", "rrt-connect", "--max-expansions", "4000"]) == 0
+    found = json.loads(out.read_text())["methods"]["rrt-connect"]
+    assert found["n"] == 2 and found["success"] == 1.0 and found["not_verified"] == 0
+    assert 0 < found["median_expansions"] <= 4000 and found["mean_cost_m"] > 3.0
+    assert main([*command, "--methods", "rrt-connect", "--max-expansions", "10"]) == 0
+    assert json.loads(out.read_text())["methods"]["rrt-connect"]["success"] == 0.0
+    assert main([*command, "--methods", "bit-star"]) == 2
+    assert "unknown method 'bit-star'; have: rrt, rrt-is" in capsys.readouterr().err

@@ -155,22 +155,30 @@ def test_costs_stay_right_under_rewiring(policy, open_world):
     np.testing.assert_allclose(with_costs(open_world, tree).cost, tree.cost, atol=2e-4)
 
 
-def test_probes_are_free_near_and_look_alike(panda, self_model, camera, image, wall_world, free):
-    config = dataclasses.replace(SMALL, probe_steps=0)
-    setup = visual_setup(Sight(panda, self_model, camera, image), Q_START, config)
-    visual, probing = setup.policy, setup.probing
+def test_probes_are_free_near_and_look_alike_and_evolve(
+    panda, self_model, camera, image, wall_world, free
+):
+    planted = jax.jit(plant, static_argnums=5)
     q_roots = jnp.asarray(Q_START)[None]
-    tree = jax.jit(plant, static_argnums=5)(
-        wall_world, visual, probing, q_roots, jax.random.key(0), 512
-    )
-    roots = np.asarray(tree.q[1 : int(tree.size)])
-    assert len(roots) == 7
-    assert np.all(np.asarray(free(wall_world, roots)))
-    assert np.linalg.norm(roots - Q_START, axis=1).max() <= 2.8 + 1e-4
-    assert np.all(np.asarray(tree.cost[1:8]) == UNREACHED) and float(tree.cost[0]) == 0
+
+    def probes(rounds):
+        config = dataclasses.replace(SMALL, probe_steps=0, probe_rounds=rounds)
+        setup = visual_setup(Sight(panda, self_model, camera, image), Q_START, config)
+        probing = setup.probing
+        tree = planted(wall_world, setup.policy, probing, q_roots, jax.random.key(0), 512)
+        assert np.all(np.asarray(tree.cost[1:8]) == UNREACHED) and float(tree.cost[0]) == 0
+        roots = np.asarray(tree.q[1 : int(tree.size)])
+        assert len(roots) == 7
+        assert np.all(np.asarray(free(wall_world, roots)))
+        return roots, probing
+
+    first, probing = probes(rounds=0)
+    evolved, _ = probes(rounds=3)
+    assert np.linalg.norm(first - Q_START, axis=1).max() <= 2.8 + 1e-4
     others = panda.lower + np.random.default_rng(0).random((64, 7)) * (panda.upper - panda.lower)
     loss = jax.jit(jax.vmap(lambda q: probing.policy.loss(wall_world, q)))
-    assert np.median(loss(roots)) < np.median(loss(others.astype(np.float32)))
+    assert np.median(loss(first)) < np.median(loss(others.astype(np.float32)))
+    assert np.mean(loss(evolved)) < 0.9 * np.mean(loss(first))
 
 
 def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(

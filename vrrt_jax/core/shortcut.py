@@ -43,9 +43,7 @@ def shortcut(
     path = np.asarray(path, np.float32)
     if len(path) < 3:
         return path
-    room = max(64, 1 << (len(path) + 2).bit_length())  # few sizes, so few compilations
-    padded = np.concatenate([path, np.repeat(path[-1:], room - len(path), axis=0)])
-    done = _shortcut(world, jnp.asarray(padded), jnp.int32(len(path)), key, rounds, patience)
+    done = _shortcut(world, padded(path), jnp.int32(len(path)), key, rounds, patience)
     return np.asarray(done.q)[: int(done.size)]
 
 
@@ -105,5 +103,16 @@ def _rows(edge: Edge, index: jax.Array) -> Edge:
 
 def path_length(world: Space, path: np.ndarray) -> float:
     """Length of a path (P, D) [rad]."""
-    q = jnp.asarray(path)
-    return float(jnp.sum(distance(world, q[:-1], q[1:])))
+    return float(_length(world, padded(path)))
+
+
+@jax.jit
+def _length(world: Space, q: jax.Array) -> jax.Array:
+    return jnp.sum(distance(world, q[:-1], q[1:]))
+
+
+def padded(path: np.ndarray) -> np.ndarray:
+    """A path (P, D) with its last waypoint repeated: few sizes, so few compilations."""
+    path = np.asarray(path, np.float32)
+    room = max(64, 1 << (len(path) + 2).bit_length())
+    return np.concatenate([path, np.repeat(path[-1:], room - len(path), axis=0)])
