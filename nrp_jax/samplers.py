@@ -51,9 +51,9 @@ class Discriminator:
     config: ModelConfig = static()
     candidates: int = static(default=500)
     along: float = static(default=0.5)  # share of candidates with a posture between the ends'
-    judged: int = static(default=192)  # most that the network looks at
-    checked: int = static(default=8)  # of the best, the first whose edge seems free is taken
-    edge_checks: int = static(default=6)  # configurations looked at along each of these edges
+    judged: int = static(default=96)  # most that the network looks at
+    checked: int = static(default=16)  # of the best, the first whose edge seems free is taken
+    edge_checks: int = static(default=12)  # configurations looked at along each of these edges
 
     def propose(
         self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
@@ -130,8 +130,8 @@ class Generator:
     variables: Any
     config: ModelConfig = static()
     num_outputs: int = static()
-    draws: int = static(default=8)  # latents, of which the first whose edge seems free is taken
-    edge_checks: int = static(default=6)  # configurations looked at along each of these edges
+    draws: int = static(default=16)  # latents, of which the first whose edge seems free is taken
+    edge_checks: int = static(default=12)  # configurations looked at along each of these edges
 
     def propose(
         self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
