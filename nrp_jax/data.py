@@ -19,6 +19,7 @@ import numpy as np
 
 from nrp_jax import houses
 from nrp_jax.grid import Grid
+from vrrt_jax.core.command import end_with_parent
 
 VERSION = 3  # of the rows
 MANIFEST = "manifest.json"
@@ -203,6 +204,7 @@ def _start_worker(cache: str | None) -> None:
     """One thread for each process (XLA reads NPROC when it starts), and the parent's cache."""
     import jax
 
+    end_with_parent()
     os.environ["NPROC"] = "1"
     os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     jax.config.update("jax_compilation_cache_dir", cache)

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from vrrt_jax.bench.methods import CAUSES, solve
 from vrrt_jax.bench.tasks import Scenery, make_task
 from vrrt_jax.config import PlannerConfig
+from vrrt_jax.core.command import end_with_parent
 from vrrt_jax.report import versions
 
 FORMAT = 1
@@ -117,6 +118,7 @@ def _rows(benchmark: Benchmark, todo: Sequence[tuple], jobs: int) -> Iterator[di
 
 def _pin(cores: Any) -> None:
     """Give a worker cores of its own, or several would fight for all of them."""
+    end_with_parent()
     os.sched_setaffinity(0, cores.get())
 
 

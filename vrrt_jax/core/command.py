@@ -1,8 +1,10 @@
-"""What the command lines share: exit codes, errors in one line, the cache of compiled programs."""
+"""What the command lines share: exit codes, one-line errors, compiled programs, workers."""
 
 import argparse
+import multiprocessing
 import os
 import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,6 +24,18 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
     except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
         print(f"{parser.prog} {arguments.command}: {error}", file=sys.stderr)
         return EXIT_BAD_INPUT
+
+
+def end_with_parent() -> None:
+    """Call this in a worker process: it ends when the one that started it is killed."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "this is no worker"
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _use_compilation_cache(name: str) -> None:
