@@ -130,7 +130,7 @@ class Generator:
     variables: Any
     config: ModelConfig = static()
     num_outputs: int = static()
-    draws: int = static(default=16)  # latents, of which the first whose edge seems free is taken
+    draws: int = static(default=8)  # latents, of which the first whose edge seems free is taken
     edge_checks: int = static(default=12)  # configurations looked at along each of these edges
 
     def propose(
