@@ -21,7 +21,7 @@ from nrp_jax import houses
 from nrp_jax.grid import Grid
 from vrrt_jax.core.command import end_with_parent
 
-VERSION = 3  # of the rows
+VERSION = 4  # of the rows
 MANIFEST = "manifest.json"
 ROWS = ("q_start", "q_goal", "waypoint", "optimal", "ratio", "length", "query")
 FIRST_TEST_SEED = 1_000_000  # homes for tests have seeds from here on, those for training below

@@ -27,7 +27,7 @@ STARTS_PER_GOAL = 10
 NEAR_GOALS = 0.25  # share of queries whose goal lies inside the window
 CRITICAL = 0.5  # share of starts in the places that most shortest paths pass ...
 NUM_CRITICAL = 100  # ... which are these nodes, as in the authors' code
-_BLOCK, _CHUNK, _LEVELS = 1 << 16, 1 << 12, 7
+_BLOCK, _CHUNK, _LEVELS = 1 << 16, 1 << 12, 7  # 2**levels parts of an edge at most
 _DRAWS = 500  # chunks of samples
 
 
@@ -157,7 +157,7 @@ def _posture_change(world: GridWorld, nodes: jax.Array, a: jax.Array, b: jax.Arr
 
 def _padded(rows: np.ndarray, size: int) -> np.ndarray:
     """Rows followed by zeros, so that compiled functions see one shape."""
-    padded = np.zeros((size, *rows.shape[1:]), np.int32)
+    padded = np.zeros((size, *rows.shape[1:]), rows.dtype)
     padded[: len(rows)] = rows
     return padded
 
@@ -170,8 +170,8 @@ def check_edges(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lengths (M,) of the edges between nodes ``pairs`` (M, 2) of ``q`` (N, D), which are free.
 
-    Every edge is halved until its parts are as short as the world's resolution. Most blocked edges
-    are out after their middle has been checked.
+    Every edge is cut into as many parts as the world's resolution asks for. Their ends are checked
+    from the middle outwards, as most blocked edges are out after their middle has been checked.
 
     Returns:
         Lengths (M,) and a mask (M,).
@@ -181,16 +181,16 @@ def check_edges(
     for first in range(0, len(pairs), _BLOCK):
         block = pairs[first : first + _BLOCK]
         padded = _padded(block, _BLOCK)
-        q_from, edge, length, level = _prepare(world, nodes, padded[:, 0], padded[:, 1])
-        alive, level = np.arange(len(block)), np.asarray(level)
+        q_from, edge, length, parts = _prepare(world, nodes, padded[:, 0], padded[:, 1])
+        parts = np.asarray(parts)[: len(block)]
         ok = np.zeros(len(block), bool)
-        for fraction, depth in _halvings():
-            done = level[alive] < depth
-            ok[alive[done]] = True
-            alive = alive[~done]
+        alive = np.arange(len(block))
+        for numerator, depth in _halvings():
+            ok[alive[parts[alive] <= 2 ** (depth - 1)]] = True
+            alive = alive[~ok[alive]]
             if len(alive) == 0:
                 break
-            alive = alive[_free_at(world, q_from, edge, alive, fraction)]
+            alive = _survivors(world, q_from, edge, parts, alive, numerator, depth)
         lengths.append(np.asarray(length)[: len(block)])
         free.append(ok)
         if on_progress is not None:
@@ -201,37 +201,51 @@ def check_edges(
 
 
 def _halvings():
-    """The middle, the quarters, the eighths ..., each with how deep it is."""
+    """The middle, the quarters, the eighths ... as numerators, each with its depth."""
     for depth in range(1, _LEVELS + 1):
-        parts = 2**depth
-        for k in range(1, parts, 2):
-            yield k / parts, depth
-    yield 0.0, _LEVELS + 1
+        for numerator in range(1, 2**depth, 2):
+            yield numerator, depth
+    yield 0, _LEVELS + 1
 
 
 @jax.jit
 def _prepare(world: GridWorld, nodes: jax.Array, a: jax.Array, b: jax.Array):
     q_from = nodes[a]
     edge = world.edge(q_from, nodes[b])
-    level = sum(~world.checkable(edge, 2**k) for k in range(_LEVELS))
-    return q_from, edge, world.length(edge), level
+    enough = jax.vmap(world.checkable, (None, 0))(edge, jnp.arange(1, 2**_LEVELS))
+    return q_from, edge, world.length(edge), 1 + jnp.sum(~enough, axis=0)
+
+
+def _survivors(
+    world: GridWorld,
+    q_from: jax.Array,
+    edge: Any,
+    parts: np.ndarray,
+    alive: np.ndarray,
+    numerator: int,
+    depth: int,
+) -> np.ndarray:
+    """Those of the edges ``alive`` (m,) that are free where their part nearest a fraction ends."""
+    num = parts[alive]
+    before, at, after = (np.floor(num * (numerator + k) / 2**depth + 0.5) for k in (-1, 0, 1))
+    new = (at != before) & (at != after)  # the others have been checked at a lower depth
+    asked, fraction = alive[new], (at[new] / num[new]).astype(np.float32)
+    results = [np.zeros(0, bool)]
+    for first in range(0, len(asked), _CHUNK):
+        index = _padded(asked[first : first + _CHUNK], _CHUNK)
+        where = _padded(fraction[first : first + _CHUNK], _CHUNK)
+        results.append(np.asarray(_chunk_free(world, q_from, edge, index, where)))
+    kept = ~new
+    kept[new] = np.concatenate(results)[: len(asked)]
+    return alive[kept]
 
 
 @jax.jit
 def _chunk_free(world: GridWorld, q_from, edge, index: jax.Array, fraction: jax.Array):
-    q_from = q_from[index]
     edge = jax.tree.map(lambda leaf: leaf[index], edge)
-    q = world.end(q_from, world.part(edge, jnp.full(index.shape, fraction)))
-    return jax.vmap(world.is_free)(q)
-
-
-def _free_at(world: GridWorld, q_from, edge, alive: np.ndarray, fraction: float) -> np.ndarray:
-    """Which of the edges ``alive`` (m,) are free at a fraction of their length, (m,) bool."""
-    results = []
-    for first in range(0, len(alive), _CHUNK):
-        index = _padded(alive[first : first + _CHUNK], _CHUNK)
-        results.append(_chunk_free(world, q_from, edge, index, jnp.float32(fraction)))
-    return np.concatenate([np.asarray(r) for r in results])[: len(alive)]
+    q = world.end(q_from[index], world.part(edge, fraction))
+    # Without the barrier the points are computed once for every use of a joint.
+    return jax.vmap(world.is_free)(jax.lax.optimization_barrier(q))
 
 
 def make_rows(

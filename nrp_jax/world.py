@@ -84,7 +84,7 @@ class GridWorld(Straight):
         longest = num_steps * self.resolution
         return self.part(edge, jnp.minimum(1.0, longest / jnp.maximum(self.span(edge), 1e-9)))
 
-    def checkable(self, edge: jax.Array, num_steps: int) -> jax.Array:
+    def checkable(self, edge: jax.Array, num_steps: int | jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`."""
         return self.span(edge) <= num_steps * self.resolution * (1 + 1e-5)
 

@@ -71,7 +71,7 @@ def test_edges_as_a_plain_loop_finds_them(world, roadmap, rng):
         step = between(world, a, b, [1.0])[0] - a
         parts = 1
         while np.abs(step).max() / parts > float(world.resolution):
-            parts *= 2
+            parts += 1
         points = between(world, a, b, np.arange(1, parts) / parts)
         padded = np.concatenate([points, np.tile(a, (64 - len(points), 1))])
         assert found == bool(np.asarray(batch_is_free(world, padded)).all())

@@ -53,7 +53,7 @@ class Space(Protocol):
         """The edge towards a target inside the limits, cut to what ``num_steps`` can check."""
         ...
 
-    def checkable(self, edge: Edge, num_steps: int) -> jax.Array:
+    def checkable(self, edge: Edge, num_steps: int | jax.Array) -> jax.Array:
         """Whether (...) ``num_steps`` sub-steps are fine enough for an edge."""
         ...
 
@@ -101,11 +101,11 @@ class Straight:
         """See :class:`Space`."""
         return difference(self, q_from, q_to)
 
-    def steer(self, q_from: jax.Array, target: jax.Array, num_steps: int) -> jax.Array:
+    def steer(self, q_from: jax.Array, target: jax.Array, num_steps: int | jax.Array) -> jax.Array:
         """See :class:`Space`."""
         return steer(self, q_from, target, num_steps * self.resolution)
 
-    def checkable(self, edge: jax.Array, num_steps: int) -> jax.Array:
+    def checkable(self, edge: jax.Array, num_steps: int | jax.Array) -> jax.Array:
         """See :class:`Space`."""
         return self.length(edge) <= num_steps * self.resolution
 
