@@ -130,7 +130,7 @@ class Generator:
     variables: Any
     config: ModelConfig = static()
     num_outputs: int = static()
-    draws: int = static(default=8)  # latents, of which the first whose edge seems free is taken
+    checked: int = static(default=8)  # waypoints made; the first whose edge seems free is taken
     edge_checks: int = static(default=12)  # configurations looked at along each of these edges
 
     def propose(
@@ -138,7 +138,7 @@ class Generator:
     ) -> jax.Array:
         """See :class:`Sampler`."""
         sight = _look(self.config, self.robot, world, q_from, q_goal)
-        z = jax.random.normal(key, (len(q_from), self.draws, self.config.latent))
+        z = jax.random.normal(key, (len(q_from), self.checked, self.config.latent))
         module: Any = build_module(self.config, self.num_outputs)
         made = module.apply(
             self.variables, sight.image, sight.start, sight.goal, z, method=CVAE.decode
@@ -228,7 +228,7 @@ def _first_free(world: GridWorld, q_from: jax.Array, q: jax.Array, num_checks: i
 
 
 def make_sampler(model: Model, **settings: Any) -> Discriminator | Generator:
-    """A sampler of a trained model; settings are fields such as ``candidates`` or ``draws``."""
+    """A sampler of a trained model; settings are fields such as ``candidates`` or ``checked``."""
     robot, config = load_robot(model.config.task), model.config
     shared = {"robot": robot, "variables": model.variables, "config": config, **settings}
     if config.kind == "discriminator":

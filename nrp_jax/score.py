@@ -223,6 +223,11 @@ def add_arguments(subparsers: Any) -> None:
     parser.add_argument("--maps", help="folder of maps from elsewhere")
     parser.add_argument("--discriminator", help="what nrp train wrote; packaged weights by default")
     parser.add_argument("--cvae", help="what nrp train wrote; packaged weights by default")
+    parser.add_argument(
+        "--unchecked",
+        action="store_true",
+        help="take the networks' first choice, as the paper does, whether its edge is free or not",
+    )
     parser.add_argument("--queries", type=int, default=50, help="of a home")
     parser.add_argument("--nodes", type=int, default=10_000, help="of a home's roadmap")
     parser.add_argument("--json", help="write the figures here")
@@ -233,13 +238,18 @@ def _run_command(arguments: argparse.Namespace) -> int:
         if value < least:
             raise ValueError(f"{name} is {value}; expected at least {least}")
     task, robot = arguments.task, load_robot(arguments.task)
-    tested = {kind: samplers.load_sampler(task, kind, getattr(arguments, kind)) for kind in KINDS}
+    checked = {"checked": 1} if arguments.unchecked else {}
+    tested = {
+        kind: samplers.load_sampler(task, kind, getattr(arguments, kind), **checked)
+        for kind in KINDS
+    }
     dataset = load_dataset(arguments.data, "test")
     if dataset.settings.task != task:
         raise ValueError(
             f"the data set is of task '{dataset.settings.task}'; expected '{task}': give another "
             "--data, or the other --task"
         )
+    maps = {} if arguments.maps is None else _maps(Path(arguments.maps), robot)
     settings = {
         "queries": arguments.queries,
         "nodes": arguments.nodes,
@@ -249,13 +259,12 @@ def _run_command(arguments: argparse.Namespace) -> int:
     seeds = [home_seed(dataset.settings, "test", k) for k in range(len(dataset.grids))]
     figures = {
         "task": task,
+        "checked": not arguments.unchecked,
         "unseen_homes": score_homes(robot, dataset.grids, tested, seeds=seeds, **settings),
     }
-    if arguments.maps is not None:
-        grids = _maps(Path(arguments.maps))
-        seeds = list(range(len(grids)))
-        found = score_homes(robot, list(grids.values()), tested, seeds=seeds, **settings)
-        figures["maps"] = {**found, "names": list(grids)}
+    if maps:
+        found = score_homes(robot, [*maps.values()], tested, seeds=range(len(maps)), **settings)
+        figures["maps"] = {**found, "names": [*maps]}
     text = json.dumps(figures, indent=2)
     print(text)
     if arguments.json:
@@ -263,17 +272,23 @@ def _run_command(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _maps(folder: Path) -> dict[str, Grid]:
+def _maps(folder: Path, robot: MobileRobot) -> dict[str, Grid]:
+    """The maps in a folder that the robot can use, by name."""
     files = sorted(file for file in folder.rglob("*") if file.suffix in (".npz", ".yaml", ".xml"))
-    if not files:
-        raise ValueError(f"no maps in '{folder}'; expected .npz, .yaml or .xml files")
     grids = {}
     for file in files:
         grid = load_map(file)
+        if grid.planar and not robot.planar:
+            print(f"map '{file}' is planar: not for {robot.name}", file=sys.stderr)
+            continue
         if abs(grid.resolution - RESOLUTION) > 1e-6:
             raise ValueError(
                 f"map '{file}' has cells of {grid.resolution} m; the models have seen "
                 f"{RESOLUTION} m: resample it"
             )
         grids[file.stem] = dataclasses.replace(grid, origin=(0.0, 0.0, 0.0))
+    if not grids:
+        raise ValueError(
+            f"no maps for {robot.name} in '{folder}'; expected .npz, .yaml or .xml files"
+        )
     return grids

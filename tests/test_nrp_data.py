@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from nrp_jax import context, data, houses
+from nrp_jax.cli import main
 
 SETTINGS = data.Settings(task="snake", queries=6, waypoints=4, nodes=500, seed=3)
 HOMES = {"homes": 2, "test_homes": 1}
@@ -60,6 +62,28 @@ def test_a_second_run_does_nothing(folder, whole):
     data.write_dataset(folder, SETTINGS, **HOMES, on_progress=lambda *c: calls.append(c))
     assert calls == [(3, 3)]
     assert before == {path: path.stat().st_mtime_ns for path in folder.glob("*.npz")}
+
+
+def test_scores_are_written(folder, tmp_path, capsys):
+    maps = tmp_path / "maps"
+    maps.mkdir()
+    data.load_dataset(folder, "test").grids[0].save(maps / "home.npz")
+    own = shutil.copytree(folder, tmp_path / "set")  # roadmaps will be kept in it
+    out = tmp_path / "score.json"
+    command = ["score", "--data", str(own), "--maps", str(maps), "--queries", "8"]
+    command += ["--nodes", "1500", "--json", str(out)]
+    assert main([*command, "--task", "snake"]) == 0
+    found = json.loads(out.read_text())
+    assert found["checked"] and found["maps"]["names"] == ["home"]
+    for homes in (found["unseen_homes"], found["maps"]):
+        for kind in ("discriminator", "cvae"):
+            assert 0.5 < homes[kind]["optimality_score"] <= 1.0 and homes[kind]["queries"] == 8
+            assert homes[kind]["ms_per_32"] > 0
+    assert main([*command, "--task", "snake", "--unchecked"]) == 0
+    rough = json.loads(out.read_text())["unseen_homes"]["cvae"]["optimality_score"]
+    assert rough < found["unseen_homes"]["cvae"]["optimality_score"]
+    assert main([*command, "--task", "fetch"]) == 2
+    assert "is of task 'snake'; expected 'fetch'" in capsys.readouterr().err
 
 
 def test_a_damaged_shard_is_refused_and_made_again(folder, whole):

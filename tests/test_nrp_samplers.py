@@ -97,7 +97,7 @@ def test_weights_of_another_task_or_kind_are_refused(models, tmp_path):
         samplers.load_sampler("snake", "discriminator", tmp_path)
     with pytest.raises(ValueError, match="unknown task 'panda'"):
         samplers.load_sampler("panda", "cvae")
-    assert samplers.load_sampler("snake", "cvae", tmp_path, draws=4).draws == 4
+    assert samplers.load_sampler("snake", "cvae", tmp_path, checked=4).checked == 4
 
 
 def test_scores_of_waypoints(world):

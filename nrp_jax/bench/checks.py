@@ -7,8 +7,6 @@ collision that either exact one sees and the batched check does not is a missed 
 
 import argparse
 import json
-import platform
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,6 +18,7 @@ from nrp_jax.grid import Grid, load_map
 from nrp_jax.robots import MobileRobot, load_robot
 from nrp_jax.world import batch_is_free, build_world, sample_configurations
 from vrrt_jax.core.kinematics import batch_link_poses
+from vrrt_jax.core.timing import best_ms, machine
 
 BATCH = 1024
 
@@ -133,9 +132,9 @@ def run(robot: MobileRobot, grid: Grid, num: int = 10_000, timed: int = 500) -> 
     by_loop = np.array([loop.is_free(row) for row in q])
     by_mujoco = np.array([scene.touching(row) is None for row in q])
     rates = {
-        "batched": BATCH / _seconds(lambda: batch_is_free(world, q[:BATCH]).block_until_ready()),
-        "sphere_loop": timed / _seconds(lambda: [loop.is_free(row) for row in q[:timed]], 3),
-        "mujoco": timed / _seconds(lambda: [scene.touching(row) for row in q[:timed]], 3),
+        "batched": _rate(BATCH, lambda: batch_is_free(world, q[:BATCH]), 20),
+        "sphere_loop": _rate(timed, lambda: [loop.is_free(row) for row in q[:timed]], 3),
+        "mujoco": _rate(timed, lambda: [scene.touching(row) for row in q[:timed]], 3),
     }
     return {
         "robot": robot.name,
@@ -180,7 +179,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
             continue
         results[name] = run(robot, grid, arguments.num)
         print(json.dumps(results[name], indent=1))
-    results["machine"] = {"platform": platform.platform(), "device": str(jax.devices()[0])}
+    results["machine"] = machine()
     if arguments.json:
         Path(arguments.json).write_text(json.dumps(results, indent=1) + "\n")
     return 0
@@ -190,18 +189,12 @@ def _batches(q: np.ndarray) -> list[np.ndarray]:
     return [q[i : i + BATCH] for i in range(0, len(q), BATCH)]
 
 
-def _seconds(function: Callable, repeats: int = 20) -> float:
-    """The fastest of some runs, after one more [s]."""
-    function()
-    times = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - started)
-    return min(times)
+def _rate(num: int, function: Callable, repeats: int) -> float:
+    """Configurations a second of a function that checks ``num`` of them."""
+    best, _ = best_ms(function, repeats=repeats)
+    return 1e3 * num / best
 
 
 def _links_us(robot: MobileRobot, q: np.ndarray) -> float:
     """Microseconds a configuration that the kinematics alone take."""
-    seconds = _seconds(lambda: batch_link_poses(robot.chain, q).block_until_ready())
-    return round(1e6 * seconds / len(q), 2)
+    return round(1e6 / _rate(len(q), lambda: batch_link_poses(robot.chain, q), 20), 2)

@@ -3,7 +3,6 @@
 import argparse
 import dataclasses
 import json
-import platform
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from nrp_jax.houses import CELLS
 from nrp_jax.planner import KINDS, METHODS, PlanResult, plan
 from nrp_jax.robots import MobileRobot, load_robot
 from nrp_jax.world import GridWorld, build_world
+from vrrt_jax.core.timing import machine
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +149,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
         "min_geodesic_m": MIN_GEODESIC,
         **budget,
         "methods": figures,
-        "machine": {"platform": platform.platform(), "device": str(jax.devices()[0])},
+        "machine": machine(),
     }
     if arguments.json:
         Path(arguments.json).write_text(json.dumps(report, indent=1) + "\n")

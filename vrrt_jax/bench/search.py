@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax import planner
-from vrrt_jax.bench.timing import interleaved_ms
 from vrrt_jax.core.edges import free_along
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.search import make_stop, search
+from vrrt_jax.core.timing import interleaved_ms
 from vrrt_jax.core.types import Expansion
 from vrrt_jax.problems import Problem, load_problem, problem_names
 from vrrt_jax.sight import Sight, visual_setup

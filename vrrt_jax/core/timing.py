@@ -1,5 +1,6 @@
 """Timing on a machine that others use too: the best of many, everything in one process."""
 
+import platform
 import time
 from collections.abc import Callable
 from typing import Any
@@ -34,3 +35,8 @@ def interleaved_ms(functions: dict[str, Callable[[], Any]], repeats: int = 30) -
             jax.block_until_ready(call())
             best[name] = min(best[name], 1e3 * (time.perf_counter() - started))
     return best
+
+
+def machine() -> dict[str, str]:
+    """What a benchmark ran on, for its report."""
+    return {"platform": platform.platform(), "device": str(jax.devices()[0])}
