@@ -3,6 +3,7 @@
 from nrp_jax.grid import Grid, load_map
 from nrp_jax.planner import PlanResult, Status, plan
 from nrp_jax.robots import MobileRobot, link_features, load_robot
+from nrp_jax.samplers import load_sampler
 from nrp_jax.world import GridWorld, batch_is_free, build_world, is_free, with_grid
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "link_features",
     "load_map",
     "load_robot",
+    "load_sampler",
     "plan",
     "with_grid",
 ]

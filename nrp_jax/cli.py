@@ -19,7 +19,7 @@ def _parser() -> argparse.ArgumentParser:
     from nrp_jax import data, houses, score, train
     from nrp_jax.bench import checks, planning
 
-    parser = argparse.ArgumentParser(
+    parser = command.Parser(
         prog="nrp", description="Motion planning in homes, with learned samplers."
     )
     commands = parser.add_subparsers(dest="command", required=True)
@@ -38,18 +38,20 @@ def _add_plan(commands) -> None:
     plan.set_defaults(run=_plan)
     plan.add_argument("--map", required=True, help=".npz, ROS .yaml or MJCF .xml")
     plan.add_argument("--robot", default="snake", help="snake or fetch")
-    plan.add_argument("--start", type=_numbers, required=True, help="configuration, as 1,2.5,0,...")
-    plan.add_argument("--goal", type=_numbers, required=True, help="configuration")
-    plan.add_argument("--method", default="rrt-connect", help="rrt, rrt-is, nrp-d, ...")
+    plan.add_argument("--start", type=_numbers, required=True, help="as --start=1,2.5,0,...")
+    plan.add_argument("--goal", type=_numbers, required=True, help="as --goal=...")
+    plan.add_argument(
+        "--method", default="rrt-connect", help="rrt, rrt-is, rrt-connect, nrp-d or nrp-g"
+    )
     plan.add_argument("--model", help="what nrp train wrote; packaged weights by default")
     plan.add_argument("--crop", type=_numbers, help="plan in x0,y0,x1,y1 of the map [m]")
     plan.add_argument("--resolution", type=float, help="of collision checks [m] and [rad]")
-    plan.add_argument("--max-expansions", type=int, default=32_000)
+    plan.add_argument("--max-expansions", type=int, default=32_000, help="lanes tried")
     plan.add_argument("--capacity", type=int, default=8192, help="nodes of the tree")
     plan.add_argument("--time-limit", type=float, default=60.0, help="of the search [s]")
-    plan.add_argument("--seed", type=int, default=0)
+    plan.add_argument("--seed", type=int, default=0, help="of all that is random")
     plan.add_argument("--out", default="out", help="folder for path.json and plan.png")
-    plan.add_argument("--no-pictures", action="store_true")
+    plan.add_argument("--no-pictures", action="store_true", help="no plan.png")
 
 
 def _plan(arguments: argparse.Namespace) -> int:
@@ -58,6 +60,7 @@ def _plan(arguments: argparse.Namespace) -> int:
     from nrp_jax.grid import load_map
     from nrp_jax.planner import KINDS, plan
     from nrp_jax.robots import load_robot
+    from nrp_jax.samplers import load_sampler
     from nrp_jax.world import build_world
 
     robot, grid = load_robot(arguments.robot), load_map(arguments.map)
@@ -66,9 +69,12 @@ def _plan(arguments: argparse.Namespace) -> int:
             raise ValueError(f"--crop has {len(arguments.crop)} numbers; expected x0,y0,x1,y1")
         grid = grid.crop(arguments.crop[:2], arguments.crop[2:])
     sampler = None
-    if arguments.method in KINDS:
-        from nrp_jax.samplers import load_sampler
-
+    if arguments.model is not None:
+        if arguments.method not in KINDS:
+            raise ValueError(
+                f"method '{arguments.method}' uses no model; drop --model, or choose a method of "
+                f"{', '.join(KINDS)}"
+            )
         sampler = load_sampler(robot.name, KINDS[arguments.method], arguments.model)
     world = build_world(robot, grid, resolution=arguments.resolution)
     result = plan(

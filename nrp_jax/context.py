@@ -9,15 +9,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 SIDE = 40  # cells
-
-
-def pad(occupied: np.ndarray) -> jax.Array:
-    """A map (X, Y, Z) with a border of occupied cells, for :func:`window`; do this once a map."""
-    border = ((SIDE // 2,) * 2, (SIDE // 2,) * 2, (0, 0))
-    return jnp.asarray(np.pad(occupied, border, constant_values=True))
 
 
 def centre_cell(
@@ -42,7 +35,7 @@ def window(
     """The window (40, 40, Z) around ``q`` (D,); vmappable.
 
     Args:
-        padded: from :func:`pad`, (X + 40, Y + 40, Z).
+        padded: (X + 40, Y + 40, Z) map with a border of 20 solid cells.
         q: (D,) configuration whose base, its first two joints, is in the map [m].
         resolution: side of a cell [m].
         origin: place of the corner of the map's first cell [m].
@@ -50,9 +43,6 @@ def window(
     corner = centre_cell(q, resolution, origin)  # the border shifts it by half a window, and back
     size = (SIDE, SIDE, padded.shape[2])
     return jax.lax.dynamic_slice(padded, (corner[0], corner[1], 0), size)
-
-
-windows = jax.jit(jax.vmap(window, (None, 0, None, None)))  # of q (n, D): (n, 40, 40, Z)
 
 
 def stacked_window(

@@ -287,14 +287,14 @@ def add_arguments(subparsers) -> None:
     """Add the ``data`` command to a command line."""
     parser = subparsers.add_parser("data", help="write a data set, or go on with one")
     parser.set_defaults(run=_run_command)
-    parser.add_argument("--task", required=True, choices=tuple(houses.CELLS))
+    parser.add_argument("--task", required=True, choices=tuple(houses.CELLS), help="whose rows")
     parser.add_argument("--out", required=True, help="folder")
     parser.add_argument("--homes", type=int, default=25, help="for training")
     parser.add_argument("--test-homes", type=int, default=5, help="apart, for tests")
     parser.add_argument("--queries", type=int, default=Settings.queries, help="of a home")
     parser.add_argument("--waypoints", type=int, default=Settings.waypoints, help="of a query")
     parser.add_argument("--nodes", type=int, default=Settings.nodes, help="of a roadmap")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="of homes, roadmaps and rows")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
 
 

@@ -14,7 +14,8 @@ from scipy.sparse import csgraph
 from nrp_jax.grid import Grid
 from nrp_jax.houses import House, floor, generate_house
 from nrp_jax.robots import MobileRobot
-from nrp_jax.world import GridWorld, batch_is_free, build_world, sample_configurations
+from nrp_jax.world import GridWorld, batch_is_free, build_world
+from vrrt_jax.core.rrt import sample_configurations
 
 EXPANSIONS = 300
 MIN_GEODESIC = 5.0  # of the base, from start to goal [m]

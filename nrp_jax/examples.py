@@ -13,15 +13,15 @@ import numpy as np
 
 from nrp_jax import context, features
 from nrp_jax.data import Dataset
+from nrp_jax.expert import POSITIVE
 from nrp_jax.field import Field, make_field
 from nrp_jax.grid import Grid
+from nrp_jax.houses import CELLS
 from nrp_jax.models import ModelConfig
 from nrp_jax.robots import MobileRobot, link_features
 from vrrt_jax.core.types import pytree
 
 RESOLUTION = 0.1  # side of a cell, in all that the models have seen [m]
-DETOUR = 1.1  # a path so much longer than the optimum still is a good one
-MAP_CELLS = {"snake": 100, "fetch": 150}  # side of the whole map, for models that see all of it
 
 
 @pytree
@@ -79,7 +79,7 @@ def view(
     if config.scope == "window":
         image = context.window(padded, q, resolution, origin)
         return image, context.centre(q, resolution, origin)
-    side, half = MAP_CELLS[config.task], context.SIDE // 2
+    side, half = CELLS[config.task], context.SIDE // 2
     size = np.array(padded.shape[:2]) - 2 * half
     excess = np.maximum(side - size, 0)  # maps may be smaller, or larger and then are cut
     solid = 1.0 if config.paper else 0.0
@@ -117,13 +117,13 @@ def load_examples(
             "give another data set, or the other --task"
         )
     rows = dataset.rows
-    good = rows["ratio"] <= DETOUR
+    good = rows["ratio"] <= POSITIVE
     if config.kind == "cvae":
         rows = {name: column[good] for name, column in rows.items()}
         target = weight = np.ones(good.sum())
     else:
         detour = np.maximum(rows["ratio"] - 1.0, 0.0)
-        target = np.exp(-detour / (DETOUR - 1.0)) if soft else good.astype(np.float32)
+        target = np.exp(-detour / (POSITIVE - 1.0)) if soft else good.astype(np.float32)
         weight = np.ones(len(good))
     grids = [grid.flatten() if robot.planar else grid for grid in dataset.grids]
     return make_examples(config, robot, grids, rows, target=target, weight=weight)

@@ -1,8 +1,9 @@
 """The expert: a dense roadmap of a home, the shortest paths on it, and what they teach.
 
-A roadmap joins every two of its nodes that fit into each other's local windows by a free edge, as
-the Neural Randomized Planner's does; edges that long are few on a shortest path, which so stays
-close to the true optimum. Letters: ``N`` nodes, ``M`` edges, ``D`` joints, ``n`` rows.
+A roadmap joins nodes that fit into each other's local windows by free edges, as the Neural
+Randomized Planner's does: of all such pairs the share that shortest paths are likely to use. Edges
+that long are few on a shortest path, which so stays close to the true optimum. Letters: ``N``
+nodes, ``M`` edges, ``D`` joints, ``n`` rows.
 """
 
 import dataclasses
@@ -17,7 +18,8 @@ from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from nrp_jax.robots import MobileRobot, link_features
-from nrp_jax.world import GridWorld, batch_is_free, sample_configurations
+from nrp_jax.world import GridWorld, batch_is_free
+from vrrt_jax.core.rrt import sample_configurations
 
 HALF_WINDOW = 1.95  # [m] what is surely inside a window, whose centre is rounded to cells
 BODY_RADIUS = {"snake": 0.11, "fetch": 0.3}  # of the base [m]
@@ -61,7 +63,9 @@ def build_roadmap(
     num_nodes: int = 10_000,
     on_progress: Callable[[float], Any] | None = None,
 ) -> Roadmap:
-    """Sample free configurations and check all edges between those in each other's window.
+    """Sample free configurations and check the edges between those in each other's window.
+
+    Of each node ``CANDIDATES`` edges on average, see :func:`_neighbours`.
 
     Args:
         world: the robot in a home.
@@ -175,6 +179,9 @@ def check_edges(
 
     Returns:
         Lengths (M,) and a mask (M,).
+
+    Raises:
+        ValueError: the world's resolution asks for more than 128 parts of an edge.
     """
     lengths, free = [], []
     nodes = jnp.asarray(q)
@@ -183,6 +190,8 @@ def check_edges(
         padded = _padded(block, _BLOCK)
         q_from, edge, length, parts = _prepare(world, nodes, padded[:, 0], padded[:, 1])
         parts = np.asarray(parts)[: len(block)]
+        if parts.max() > 2**_LEVELS:
+            raise ValueError(f"resolution is {float(world.resolution):g}: too fine for roadmaps")
         ok = np.zeros(len(block), bool)
         alive = np.arange(len(block))
         for numerator, depth in _halvings():
@@ -212,7 +221,7 @@ def _halvings():
 def _prepare(world: GridWorld, nodes: jax.Array, a: jax.Array, b: jax.Array):
     q_from = nodes[a]
     edge = world.edge(q_from, nodes[b])
-    enough = jax.vmap(world.checkable, (None, 0))(edge, jnp.arange(1, 2**_LEVELS))
+    enough = jax.vmap(world.checkable, (None, 0))(edge, jnp.arange(1, 2**_LEVELS + 1))
     return q_from, edge, world.length(edge), 1 + jnp.sum(~enough, axis=0)
 
 

@@ -19,12 +19,6 @@ WAY = 4  # places along an edge at which the surroundings are read
 HEADING = 2  # the joint that turns the whole robot, for both robots
 
 
-def angular(robot: MobileRobot) -> np.ndarray:
-    """Which joints (D,) are angles: all but the base's place and the Fetch's torso."""
-    linear = ("x", "y", "torso_lift_joint")
-    return np.array([name not in linear for name in robot.joint_names])
-
-
 def to_local(q: jax.Array, centre: jax.Array) -> jax.Array:
     """Configurations (..., D) in the frame at a place (..., 2) of the map [m]; no rotation."""
     return jnp.concatenate([q[..., :2] - centre, q[..., 2:]], axis=-1)
@@ -51,7 +45,7 @@ def configuration_features(
     if config.paper:
         joints = q
     else:
-        is_angle = angular(robot)
+        is_angle = np.array(robot.angular)
         angle = q[is_angle]
         joints = jnp.concatenate([q[~is_angle], jnp.cos(angle), jnp.sin(angle)])
     return jnp.concatenate([joints, (points[:, :2] if robot.planar else points).reshape(-1)])
@@ -81,7 +75,7 @@ def to_configuration(config: ModelConfig, robot: MobileRobot, features: jax.Arra
     num = len(robot.joint_names)
     if config.paper:
         return features[..., :num]
-    is_angle = angular(robot)
+    is_angle = np.array(robot.angular)
     linear, cosine, sine = jnp.split(
         features[..., : num + is_angle.sum()], [num - is_angle.sum(), num], axis=-1
     )

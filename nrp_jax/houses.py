@@ -230,7 +230,7 @@ def _scan(rng: np.random.Generator, draft: _Draft, kind: str) -> np.ndarray:
 
 
 def save_figure(houses: list[House], path: str | Path) -> None:
-    """Draw homes side by side: walls dark, furniture by height, overhangs hatched light."""
+    """Draw homes side by side: walls dark, furniture browner with its height, overhangs bluish."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -274,9 +274,9 @@ def add_arguments(subparsers) -> None:
     """Add the ``homes`` command to a command line."""
     parser = subparsers.add_parser("homes", help="draw random homes")
     parser.set_defaults(run=_run)
-    parser.add_argument("--num", type=int, default=20)
+    parser.add_argument("--num", type=int, default=20, help="homes")
     parser.add_argument("--seed", type=int, default=0, help="of the first; the others follow")
-    parser.add_argument("--task", default="snake", choices=tuple(CELLS))
+    parser.add_argument("--task", default="snake", choices=tuple(CELLS), help="whose homes")
     parser.add_argument("--out", required=True, help="a .png file")
 
 

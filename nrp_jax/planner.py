@@ -14,6 +14,7 @@ from nrp_jax.exact import STEP, ExactScene, Verification, verify
 from nrp_jax.grid import Grid
 from nrp_jax.policies import RRT, NeuralRRT
 from nrp_jax.robots import MobileRobot
+from nrp_jax.samplers import load_sampler
 from nrp_jax.world import CarWorld, GridWorld, batch_is_free, build_world
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import into_limits
@@ -57,7 +58,7 @@ class PlanResult:
     path: np.ndarray  # (P, D) waypoints joined by the world's edges; of a failure, the best try
     trajectory: np.ndarray  # (T, D) the same in steps of 0.02 m or rad at most
     raw_path: np.ndarray  # (P', D) as the tree has it
-    cost: float  # length of ``path`` in the world's metric
+    cost: float  # length of ``path``: of the base's way, and a weight times that of the arm's [m]
     verification: Verification | None  # None if the goal was not reached
     expansions: int  # lanes tried
     rejected: Mapping[str, int]  # lanes lost, by reason
@@ -109,8 +110,9 @@ def plan(
         q_start: (D,) configuration [m] and [rad].
         q_goal: (D,) configuration.
         key: random key; the same key gives the same plan on the same machine, unless time ends it.
-        method: one of :data:`METHODS`; "nrp-d" and "nrp-g" need a sampler.
-        sampler: what proposes waypoints: a pytree with ``propose(world, q_from, q_goal, key)``.
+        method: one of :data:`METHODS`.
+        sampler: what proposes waypoints to "nrp-d" and "nrp-g": a pytree with ``propose(world,
+            q_from, q_goal, key)``; the packaged weights by default.
         world: of this robot and grid, to save building it again.
         goal_bias: share of expansions that aim at the goal.
         straight_rate: share of expansions that go straight, for methods with a sampler.
@@ -127,6 +129,8 @@ def plan(
     world = build_world(robot, grid) if world is None else world
     start = check_configuration(robot, world, q_start, "start")
     goal = check_configuration(robot, world, q_goal, "goal")
+    if sampler is None and method in KINDS:
+        sampler = load_sampler(robot.name, KINDS[method])
     make = {"goal_bias": goal_bias, "straight_rate": straight_rate, "lanes": lanes}
     policy, tree = _setup(world, start, goal, method, sampler, make, capacity)
     scene, spent = scene or ExactScene(robot, grid), {}
@@ -235,8 +239,6 @@ def _setup(
     }
     if method in ("rrt", "rrt-is"):
         policy = RRT(**common, intermediate=method == "rrt-is")
-    elif sampler is None:
-        raise ValueError(f"method '{method}' needs a sampler: pass sampler=...")
     else:
         rate = jnp.float32(make["straight_rate"])
         policy = NeuralRRT(**common, sampler=sampler, straight_rate=rate)

@@ -3,9 +3,10 @@
 import jax
 import jax.numpy as jnp
 
-from nrp_jax.world import GridWorld, sample_configurations
+from nrp_jax.world import GridWorld
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import free_along
+from vrrt_jax.core.rrt import sample_configurations
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
 
 

@@ -59,12 +59,24 @@ def curve_length(curve: Curve) -> jax.Array:
     return sum((jnp.abs(drive) for drive in curve.drive[1:]), jnp.abs(curve.drive[0]))
 
 
-def cut(curve: Curve, fraction: jax.Array) -> Curve:
-    """The first fraction (...) of curves."""
-    left, drives = fraction * curve_length(curve), []
-    for drive in curve.drive:
-        size = jnp.abs(drive)
-        drives.append(jnp.sign(drive) * jnp.clip(left, 0.0, size))
+def extents(curve: Curve, radius: jax.Array | float) -> list[jax.Array]:
+    """How far the pieces of curves go, 5 of (...): the way [m], or the turn [rad] if that is more.
+
+    On a tight arc a short way is a large turn, which sweeps whatever the robot holds out.
+    """
+    tight = jnp.maximum(radius, 1.0)
+    return [
+        jnp.abs(drive) * jnp.where(turn == 0, radius, tight)
+        for drive, turn in zip(curve.drive, curve.turn, strict=True)
+    ]
+
+
+def cut(curve: Curve, fraction: jax.Array, radius: jax.Array | float) -> Curve:
+    """The first fraction (...) of curves, of their :func:`extents`."""
+    sizes, drives = extents(curve, radius), []
+    left = fraction * sum(sizes[1:], sizes[0])
+    for drive, size in zip(curve.drive, sizes, strict=True):
+        drives.append(drive * jnp.clip(left / jnp.maximum(size, 1e-12), 0.0, 1.0))
         left = left - size
     turns = tuple(jnp.broadcast_to(turn, left.shape) for turn in curve.turn)
     return Curve(drive=tuple(drives), turn=turns)
@@ -85,8 +97,11 @@ def follow(a: jax.Array, curve: Curve, radius: jax.Array | float) -> jax.Array:
 def interpolate(
     a: jax.Array, b: jax.Array, fraction: jax.Array | float, radius: jax.Array | float
 ) -> jax.Array:
-    """Poses (..., 3) at a fraction (...) of the shortest paths; headings in [-pi, pi)."""
-    pose = follow(a, cut(shortest(a, b, radius), jnp.asarray(fraction)), radius)
+    """Poses (..., 3) at a fraction (...) of the shortest paths, as :func:`cut` has it.
+
+    Headings are in [-pi, pi).
+    """
+    pose = follow(a, cut(shortest(a, b, radius), jnp.asarray(fraction), radius), radius)
     return pose.at[..., 2].set(_wrap(pose[..., 2]))
 
 

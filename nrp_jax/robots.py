@@ -56,6 +56,7 @@ class MobileRobot:
     feature_point: jax.Array  # (F, 3) in the link's frame [m]
     name: str = static()
     joint_names: tuple[str, ...] = static()  # (D,)
+    angular: tuple[bool, ...] = static()  # (D,) joints that turn; the others slide
     planar: bool = static()  # heights do not matter
     xml: str = static()  # MJCF of primitive geoms
 
@@ -110,6 +111,7 @@ def load_robot(name: str) -> MobileRobot:
         grain=np.where(is_base, *_GRAIN[name]),
     )
     limited = model.jnt_limited.astype(bool)
+    angular = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
     lower = np.where(limited, model.jnt_range[:, 0], -np.pi)[base_dim:]
     upper = np.where(limited, model.jnt_range[:, 1], np.pi)[base_dim:]
     site_pose = body_in_link[model.site_bodyid]
@@ -118,7 +120,7 @@ def load_robot(name: str) -> MobileRobot:
         chain=chain,
         lower=jnp.asarray(lower, jnp.float32),
         upper=jnp.asarray(upper, jnp.float32),
-        wraps=jnp.asarray(~limited & (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)),
+        wraps=jnp.asarray(~limited & angular),
         cover=cover,
         pairs=jnp.asarray(_checked_pairs(model, owner[: 0 if planar else None]), jnp.int32),
         plates=_plates(model, body_link, body_in_link) if planar else None,
@@ -127,6 +129,7 @@ def load_robot(name: str) -> MobileRobot:
         feature_point=jnp.asarray(points, jnp.float32),
         name=name,
         joint_names=tuple(model.joint(j).name for j in range(model.njnt)),
+        angular=tuple(angular.tolist()),
         planar=planar,
         xml=xml,
     )

@@ -28,7 +28,8 @@ from nrp_jax.expert import Extents, Roadmap, build_roadmap, check_edges, make_ro
 from nrp_jax.grid import Grid, load_map
 from nrp_jax.models import KINDS, TASKS
 from nrp_jax.robots import MobileRobot, load_robot
-from nrp_jax.world import GridWorld, build_world
+from nrp_jax.world import GridWorld, batch_is_free, build_world
+from vrrt_jax.core.timing import machine
 
 ROUND = 256  # edges from a waypoint into the roadmap that are checked before the next are looked at
 
@@ -67,6 +68,7 @@ def optimality(
     q = np.concatenate([roadmap.q, waypoint]).astype(np.float32)
     own = len(roadmap.q) + np.arange(num)
     first, free = check_edges(world, q, np.stack([queries.start, own], axis=1))
+    free &= np.asarray(batch_is_free(world, waypoint))  # of edges the ends are not looked at
     best = np.where(free, np.inf, 0.0)  # length on from the waypoint; 0 for what needs no search
     extents = Extents(robot, q)
     waiting = {}
@@ -218,7 +220,7 @@ def add_arguments(subparsers: Any) -> None:
     """Add the ``score`` command to a command line."""
     parser = subparsers.add_parser("score", help="measure how good proposed waypoints are")
     parser.set_defaults(run=_run_command)
-    parser.add_argument("--task", required=True, choices=TASKS)
+    parser.add_argument("--task", required=True, choices=TASKS, help="whose samplers")
     parser.add_argument("--data", required=True, help="folder that nrp data wrote: its test homes")
     parser.add_argument("--maps", help="folder of maps from elsewhere")
     parser.add_argument("--discriminator", help="what nrp train wrote; packaged weights by default")
@@ -260,6 +262,8 @@ def _run_command(arguments: argparse.Namespace) -> int:
     figures = {
         "task": task,
         "checked": not arguments.unchecked,
+        "nodes": arguments.nodes,
+        "machine": machine(),
         "unseen_homes": score_homes(robot, dataset.grids, tested, seeds=seeds, **settings),
     }
     if maps:

@@ -237,20 +237,24 @@ def add_arguments(subparsers: Any) -> None:
     """Add the ``train`` command to a command line."""
     parser = subparsers.add_parser("train", help="train a sampler, or go on training it")
     parser.set_defaults(run=_run_command)
-    parser.add_argument("--task", required=True, choices=models.TASKS)
-    parser.add_argument("--model", required=True, choices=models.KINDS)
+    parser.add_argument("--task", required=True, choices=models.TASKS, help="whose sampler")
+    parser.add_argument("--model", required=True, choices=models.KINDS, help="which sampler")
     parser.add_argument("--paper", action="store_true", help="the published architecture")
     parser.add_argument(
         "--global", dest="whole_map", action="store_true", help="see the whole map, not a window"
     )
     parser.add_argument("--data", required=True, help="folder that nrp data wrote")
     parser.add_argument("--out", required=True, help="folder for the model, log and curves")
-    parser.add_argument("--epochs", type=int, default=TrainConfig.epochs)
+    parser.add_argument("--epochs", type=int, default=TrainConfig.epochs, help="at most")
     parser.add_argument("--batch", type=int, default=TrainConfig.batch, help="queries a step")
-    parser.add_argument("--learning-rate", type=float, default=TrainConfig.learning_rate)
-    parser.add_argument("--patience", type=int, default=TrainConfig.patience, help="epochs")
+    parser.add_argument(
+        "--learning-rate", type=float, default=TrainConfig.learning_rate, help="at its peak"
+    )
+    parser.add_argument(
+        "--patience", type=int, default=TrainConfig.patience, help="epochs without progress"
+    )
     parser.add_argument("--hard", action="store_true", help="labels 0 and 1, none between")
-    parser.add_argument("--seed", type=int, default=TrainConfig.seed)
+    parser.add_argument("--seed", type=int, default=TrainConfig.seed, help="of weights and batches")
 
 
 def _run_command(arguments: argparse.Namespace) -> int:

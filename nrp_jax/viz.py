@@ -39,7 +39,10 @@ def outlines(robot: MobileRobot, q: np.ndarray) -> list[np.ndarray]:
 
 
 def draw_map(axes, grid: Grid) -> None:
-    """Draw a map from above; cells that are solid above 0.4 m only are lighter."""
+    """Draw a map from above; cells that are solid above 0.4 m only are lighter.
+
+    For a planar robot give what it sees of the map, ``grid.flatten()``.
+    """
     low = grid.flatten(z_high=0.4).occupied[:, :, 0]
     seen = grid.occupied.any(axis=2)
     shade = np.ones((*seen.shape, 3))
@@ -62,7 +65,9 @@ def draw_robot(axes, robot: MobileRobot, q: np.ndarray, colour: str, alpha: floa
 
     for polygon in outlines(robot, q):
         axes.add_patch(
-            Polygon(polygon, facecolor=colour, edgecolor="black", linewidth=0.3, alpha=alpha)
+            Polygon(
+                polygon, facecolor=colour, edgecolor="black", linewidth=0.3, alpha=alpha, zorder=3
+            )
         )
 
 
@@ -114,7 +119,7 @@ def save_plan(
 
     width, height = grid.size[:2]
     figure, axes = plt.subplots(figsize=(8, 8 * height / width + 0.6), layout="constrained")
-    draw_map(axes, grid)
+    draw_map(axes, grid.flatten() if robot.planar else grid)
     draw_tree(axes, world, result)
     trajectory = result.trajectory
     axes.plot(*trajectory[:, :2].T, color=_COLOURS["path"], linewidth=1.5)

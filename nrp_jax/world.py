@@ -114,7 +114,8 @@ class CarWorld(GridWorld):
     def distances(self, nodes: jax.Array, q: jax.Array, among: jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`; +inf beyond a shortlist of nearest nodes.
 
-        No drive is shorter than the straight line, nor than its turn at the smallest radius.
+        The shortlist goes by a bound: no drive is shorter than the straight line, nor than its turn
+        at the smallest radius. The nearest is nearly always in it.
         """
         line, arm = jnp.zeros((2, q.shape[0], nodes.shape[0]), q.dtype)
         for joint in range(q.shape[1]):
@@ -144,7 +145,7 @@ class CarWorld(GridWorld):
     def part(self, edge: CarEdge, fraction: jax.Array) -> CarEdge:
         """See :class:`vrrt_jax.core.edges.Space`."""
         return CarEdge(
-            curve=reeds_shepp.cut(edge.curve, fraction),
+            curve=reeds_shepp.cut(edge.curve, fraction, self.radius),
             arm=edge.arm * fraction[..., None],
             target=edge.target,
             done=edge.done * fraction,
@@ -155,8 +156,9 @@ class CarWorld(GridWorld):
         return self._drive(edge) + self.arm_weight * _norm(edge.arm)
 
     def span(self, edge: CarEdge) -> jax.Array:
-        """The longer (...) of the base's way [m] and the longest of any joint of the arm."""
-        return jnp.maximum(self._drive(edge), jnp.max(jnp.abs(edge.arm), axis=-1))
+        """The longest way (...) of base, with what it turns, or any joint [m] or [rad]."""
+        pieces = reeds_shepp.extents(edge.curve, self.radius)
+        return jnp.maximum(sum(pieces[1:], pieces[0]), jnp.max(jnp.abs(edge.arm), axis=-1))
 
     def end(self, q_from: jax.Array, edge: CarEdge) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`; the whole edge ends at its target exactly."""
@@ -222,7 +224,13 @@ def _base_is_free(
 
 
 def build_world(
-    robot: MobileRobot, grid: Grid, *, wrap: bool = True, resolution: float | None = None
+    robot: MobileRobot,
+    grid: Grid,
+    *,
+    wrap: bool = True,
+    resolution: float | None = None,
+    arm_weight: float | None = None,
+    turning_radius: float = TURNING_RADIUS,
 ) -> GridWorld:
     """Put a robot into a home.
 
@@ -231,14 +239,24 @@ def build_world(
         grid: from :func:`nrp_jax.load_map` or a generator; the snake sees its planar map.
         wrap: joints without limits turn the short way round; otherwise they are intervals, as in
             the paper. A heading always wraps.
-        resolution: longest sub-step of any joint between two collision checks [m] or [rad].
+        resolution: longest sub-step of any joint between two collision checks [m] or [rad]; the
+            paper's by default.
+        arm_weight: metres that a radian of the arm counts for in the metric; the paper's by
+            default.
+        turning_radius: smallest one of a base that drives like a car [m].
 
     Raises:
-        ValueError: a planar map for a robot that is not, or a resolution that is not positive.
+        ValueError: a planar map for a robot that is not, or a setting that is not positive.
     """
     resolution = RESOLUTION[robot.name] if resolution is None else resolution
-    if not resolution > 0:
-        raise ValueError(f"resolution is {resolution}; expected a positive number, such as 0.1")
+    arm_weight = ARM_WEIGHT[robot.name] if arm_weight is None else arm_weight
+    for name, value in (
+        ("resolution", resolution),
+        ("arm_weight", arm_weight),
+        ("turning_radius", turning_radius),
+    ):
+        if not value > 0:
+            raise ValueError(f"{name} is {value}; expected a positive number, such as 0.1")
     grid = _fitting(robot.planar, grid)
     is_arm = np.asarray(robot.cover.link) > robot.base_dim + 1
     floor = np.where(is_arm & (not robot.planar), robot.cover.radius, -np.inf)
@@ -257,12 +275,12 @@ def build_world(
         "lower": _float(np.concatenate([corner, np.negative(turn), robot.lower])),
         "upper": _float(np.concatenate([corner + grid.size[:2], turn, robot.upper])),
         "wraps": robot.wraps & (is_base | wrap),
-        "arm_weight": jnp.float32(ARM_WEIGHT[robot.name]),
+        "arm_weight": jnp.float32(arm_weight),
         "resolution": jnp.float32(resolution),
     }
     if robot.base_dim == 2:
         return GridWorld(**fields)
-    return CarWorld(**fields, radius=jnp.float32(TURNING_RADIUS))
+    return CarWorld(**fields, radius=jnp.float32(turning_radius))
 
 
 def with_grid(world: GridWorld, grid: Grid) -> GridWorld:
@@ -285,18 +303,12 @@ def with_grid(world: GridWorld, grid: Grid) -> GridWorld:
     )
 
 
-def sample_configurations(world: GridWorld, key: jax.Array, n: int) -> jax.Array:
-    """Uniform configurations (n, D) inside the limits."""
-    shape = (n, world.lower.shape[0])
-    return jax.random.uniform(key, shape, minval=world.lower, maxval=world.upper)
-
-
 def _norm(step: jax.Array) -> jax.Array:
     return jnp.sqrt(jnp.sum(step**2, axis=-1))
 
 
 def _shortlist(bound: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Smallest bounds (B, k) of (B, N) and where they are; the nearest is among them."""
+    """Smallest bounds (B, k) of (B, N) and where they are."""
     smallest, index = jax.lax.top_k(-bound, min(SHORTLIST, bound.shape[1]))
     return -smallest, index
 

@@ -13,7 +13,8 @@ from nrp_jax.checkpoint import Model, build_module, check_model, load_model, sav
 from nrp_jax.examples import RESOLUTION, relations, surrounding_map, view
 from nrp_jax.models import ModelConfig
 from nrp_jax.robots import link_features, load_robot
-from nrp_jax.world import build_world, is_free, sample_configurations
+from nrp_jax.world import build_world, is_free
+from vrrt_jax.core.rrt import sample_configurations
 
 SIZES = {"snake": (40, 40, 1), "fetch": (40, 40, 20)}
 

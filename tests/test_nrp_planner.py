@@ -135,6 +135,7 @@ def test_fetch_drives_and_reaches(snake):
     sideways = np.abs(step[:, 1] * np.cos(middle) - step[:, 0] * np.sin(middle))
     assert sideways.max() < 2e-3
     assert np.all(np.abs(turn) <= np.linalg.norm(step, axis=1) / 0.095 + 2e-3)
+    assert np.abs(turn).max() <= 0.0205  # what the arm holds out is not swept past anything
 
 
 def test_verification_sees_what_is_wrong(snake, home, scene, solve):

@@ -13,8 +13,8 @@ from nrp_jax.bench.checks import SphereLoop
 from nrp_jax.exact import ExactScene, merge_cells
 from nrp_jax.field import make_field, room
 from nrp_jax.grid import coarsened, load_map, make_grid
-from nrp_jax.world import sample_configurations
 from vrrt_jax.core.edges import free_steps
+from vrrt_jax.core.rrt import sample_configurations
 
 MAPS = Path(os.environ.get("NRP_MAPS", "maps-are-elsewhere"))
 

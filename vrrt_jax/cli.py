@@ -18,7 +18,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = command.Parser(
         prog="vrrt", description="From a picture of the goal to a verified, collision-free path."
     )
     commands = parser.add_subparsers(dest="command", required=True)
@@ -30,9 +30,9 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--world", help="an MJCF file of obstacles, or a packaged world")
     plan.add_argument("--goal", nargs="+", help="goal images, RGB with mask or plain background")
     plan.add_argument("--camera", nargs="+", help="a JSON file for each goal image")
-    plan.add_argument("--start", type=_numbers, help="start configuration, as 0,0.3,...")
+    plan.add_argument("--start", type=_numbers, help="start configuration, as --start=0,0.3,...")
     plan.add_argument("--self-model", help="trained .npz; the robot's own by default")
-    plan.add_argument("--seed", type=int, default=0)
+    plan.add_argument("--seed", type=int, default=0, help="of all that is random")
     plan.add_argument("--time-limit", type=float, default=60.0, help="of the search [s]")
     plan.add_argument("--paper", action="store_true", help="the published settings")
     plan.add_argument("--capacity", type=int, help="nodes of the tree")
@@ -42,7 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     render = commands.add_parser("render", help="make a goal image with MuJoCo's renderer")
     render.set_defaults(run=_render)
     _add_robot(render)
-    render.add_argument("--q", type=_numbers, required=True, help="configuration, as 0,0.3,...")
+    render.add_argument("--q", type=_numbers, required=True, help="configuration, as --q=0,0.3,...")
     render.add_argument("--camera", required=True, help="a JSON file")
     render.add_argument("--size", type=_size, default=(480, 480), help="WIDTHxHEIGHT [px]")
     render.add_argument("--out", required=True, help="a .png file")
@@ -51,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
     fit.set_defaults(run=_fit)
     _add_robot(fit)
     fit.add_argument("--out", required=True, help="a .npz file")
-    fit.add_argument("--seed", type=int, default=0)
+    fit.add_argument("--seed", type=int, default=0, help="of poses, cameras and splats")
     fit.add_argument("--images", type=int, help="number of training images")
     fit.add_argument("--detail", type=float, default=1.0, help="times the usual number of splats")
 
@@ -59,7 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     spheres.set_defaults(run=_spheres)
     _add_robot(spheres)
     spheres.add_argument("--out", help="the MJCF file to write; only measured without it")
-    spheres.add_argument("--seed", type=int, default=0)
+    spheres.add_argument("--seed", type=int, default=0, help="of fit and measurement")
     spheres.add_argument("--num", type=int, default=10_000, help="configurations to measure on")
 
     bench = commands.add_parser("bench", help="measure speed, success or settings")
@@ -83,8 +83,8 @@ def _parser() -> argparse.ArgumentParser:
     worlds = commands.add_parser("worlds", help="make random worlds around a robot")
     worlds.set_defaults(run=_worlds)
     _add_robot(worlds)
-    worlds.add_argument("--num", type=int, default=6)
-    worlds.add_argument("--seed", type=int, default=0)
+    worlds.add_argument("--num", type=int, default=6, help="worlds")
+    worlds.add_argument("--seed", type=int, default=0, help="before the first world's")
     worlds.add_argument("--out", required=True, help="folder for ROBOT_1.xml and so on")
     return parser
 
@@ -93,15 +93,17 @@ def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
     parser.set_defaults(run=_protocol)
     parser.add_argument("--robot", required=True, help="panda, ur5e or fetch")
     parser.add_argument("--levels", default="0.5,1.0,1.5,2.0,2.5", help="distances [rad]")
-    parser.add_argument("--tasks-per-level", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--tasks-per-level", type=int, default=20, help="tasks at each distance")
+    parser.add_argument("--seed", type=int, default=0, help="of tasks and plans")
     if what == "ablation":
         parser.add_argument("--only", help="one setting, such as eta; all by default")
         parser.add_argument("--config", default="paper", help="whose settings: paper or default")
     else:
-        parser.add_argument("--method", default="vrrt", help="vrrt, dr-robot, prof-robot, ...")
+        parser.add_argument(
+            "--method", default="vrrt", help="vrrt, dr-robot, dr-robot-rrt-star or prof-robot"
+        )
         parser.add_argument("--config", default="default", help="default or paper")
-    parser.add_argument("--views", type=int, default=1, choices=(1, 2))
+    parser.add_argument("--views", type=int, default=1, choices=(1, 2), help="cameras")
     parser.add_argument("--azimuth", type=float, default=0.0, help="turn the cameras [degree]")
     parser.add_argument("--light", type=float, default=1.0, help="brightness of the lamp")
     parser.add_argument("--occluded", action="store_true", help="obstacles hide the robot")
@@ -281,13 +283,13 @@ def _spheres(arguments: argparse.Namespace) -> int:
 
 
 def _meshes(robot):
-    from vrrt_jax.robots.sources import mesh_spec
+    from vrrt_jax.robots.sources import install_hint, mesh_spec
 
     spec = mesh_spec(robot)
     if spec is None:
         raise ValueError(
             f"the meshes of '{robot.name}' are not on this machine; pip install "
-            "'vrrt-jax[meshes]', or set MENAGERIE_ROOT to a checkout of MuJoCo Menagerie"
+            f"{install_hint(robot.mesh_source)}"
         )
     return spec
 

@@ -12,9 +12,9 @@ from vrrt_jax.core.verify import Verification
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PlannerConfig:
-    """Settings of Visual-RRT; all but the sizes are traced, so changing them never re-compiles.
+    """Settings of Visual-RRT. The defaults are what measures best; :meth:`paper` is as published.
 
-    The defaults are what measures best; :meth:`paper` has the published values.
+    A change re-compiles where a comment says so, and nowhere else.
     """
 
     alpha: float = 0.04  # Adam step [rad]
@@ -42,7 +42,7 @@ class PlannerConfig:
     start_prior: float = 0.005  # goal losses that a radian from the start costs there
     start_preference: float = 0.015  # share of the loss that a squared radian from it counts for
     inherit: bool = True  # a child goes on with its parent's Adam moments
-    rewiring: bool = True  # RRT*
+    rewiring: bool = True  # RRT* (re-compiles)
     rewire_radius: float = 0.3  # [rad]
     max_iterations: int = 400
     settle: int = 12  # once matched, iterations without improvement until the search ends
@@ -80,6 +80,7 @@ class PlanResult:
     alternatives: np.ndarray  # (A, D) other configurations that match the image as well
     loss: float  # of the target: image loss, or distance to a joint goal [rad]
     goal_loss: float  # at or below which it counts as matched
+    search_goal_loss: float  # the same in the search, on its smaller images
     cost: float  # length of ``path`` [rad]
     verification: Verification | None  # None if there was nothing to verify
     rejected: Mapping[str, int]  # lanes lost, by reason

@@ -55,6 +55,7 @@ def finish_visual(
         config: settings.
     """
     score, q = np.asarray(found.tree.score), np.asarray(found.tree.q)
+    search_goal_loss = goal_loss
     hurried = found.stopped in (Stopped.TIME_LIMIT, Stopped.INTERRUPTED)
     if polishing is not None and not hurried:
         goal_loss = polishing.goal_loss
@@ -82,7 +83,7 @@ def finish_visual(
     target, loss = q[end], float(score[end])
     alike = [k for k in rivals if k != end and score[k] <= min(ALIKE * loss, goal_loss)]
     result = finish(robot, world, found, path, target, loss, goal_loss, key, config, q_start)
-    return dataclasses.replace(result, alternatives=q[alike])
+    return dataclasses.replace(result, alternatives=q[alike], search_goal_loss=search_goal_loss)
 
 
 def _distinct(
@@ -206,6 +207,7 @@ def finish(
         alternatives=target[None][:0],
         loss=loss,
         goal_loss=goal_loss,
+        search_goal_loss=goal_loss,
         cost=path_length(world, path),
         verification=verification,
         rejected={reason.name.lower(): int(rejected[reason]) for reason in Rejection},

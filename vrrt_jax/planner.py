@@ -218,7 +218,7 @@ def plan_to_configuration(
         key: random key.
         planner: "rrt", "rrt-star" (goes on to improve until its iterations are used up) or
             "rrt-connect".
-        config: budget, capacity, lanes and rewiring radius are used.
+        config: budget, capacity and lanes are used.
         goal_bias: share of lanes that aim at the goal, for "rrt" and "rrt-star".
         on_progress: called with the search state and the seconds so far.
 

@@ -16,8 +16,9 @@ import numpy as np
 from nrp_jax.exact import ExactScene
 from nrp_jax.grid import Grid, load_map
 from nrp_jax.robots import MobileRobot, load_robot
-from nrp_jax.world import batch_is_free, build_world, sample_configurations
+from nrp_jax.world import batch_is_free, build_world
 from vrrt_jax.core.kinematics import batch_link_poses
+from vrrt_jax.core.rrt import sample_configurations
 from vrrt_jax.core.timing import best_ms, machine
 
 BATCH = 1024

@@ -7,8 +7,24 @@ import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 EXIT_SOLVED, EXIT_UNSOLVED, EXIT_BAD_INPUT = 0, 1, 2
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser, also of sub-commands, whose help tells the defaults that are set."""
+
+    def __init__(self, *args: Any, **settings: Any):
+        """See :class:`argparse.ArgumentParser`."""
+        settings.setdefault("formatter_class", _Defaults)
+        super().__init__(*args, **settings)
+
+
+class _Defaults(argparse.ArgumentDefaultsHelpFormatter):
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        told = action.default not in (None, False) and not action.required
+        return super()._get_help_string(action) if told else action.help
 
 
 def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> int:

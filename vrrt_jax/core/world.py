@@ -200,6 +200,13 @@ def move_obstacle(
 ) -> World:
     """Move, turn or resize one obstacle; nothing re-compiles.
 
+    Args:
+        world: robot and obstacles.
+        name: of the obstacle.
+        position: (3,) of its centre in the world [m].
+        quaternion: (4,) its turn in the world, w first.
+        size: up to (3,) as MuJoCo's geom size: radius and half lengths [m].
+
     Raises:
         ValueError: no obstacle of that name.
     """
