@@ -13,6 +13,8 @@ import numpy as np
 
 from nrp_jax.models import CVAE, Discriminator, ModelConfig
 
+VERSION = 2  # of what the networks see, see :mod:`nrp_jax.features`
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Model:
@@ -40,7 +42,8 @@ def save_model(model: Model, path: str | Path) -> None:
     arrays: dict[str, Any] = {
         f"variables/{name}": np.asarray(leaf, np.float16) for name, leaf in flat.items()
     }
-    description = json.dumps({"config": dataclasses.asdict(model.config), "info": model.info})
+    config = dataclasses.asdict(model.config)
+    description = json.dumps({"version": VERSION, "config": config, "info": model.info})
     part = path.with_suffix(".part")
     with open(part, "wb") as handle:
         np.savez_compressed(handle, description=np.array(description), **arrays)
@@ -61,6 +64,8 @@ def load_model(path: str | Path) -> Model:
     try:
         with np.load(path) as saved:
             description = json.loads(str(saved["description"]))
+            if description["version"] != VERSION:
+                raise ValueError("another version")
             flat = {
                 name.removeprefix("variables/"): jnp.asarray(saved[name], jnp.float32)
                 for name in saved.files

@@ -116,6 +116,13 @@ def load_dataset(folder: str | Path, split: str = "train") -> Dataset:
         raise ValueError(f"unknown split '{split}'; have: train, test")
     manifest = _read_manifest(folder)
     settings = Settings(**manifest["settings"])
+    current = (houses.VERSION, VERSION)
+    if (settings.homes_version, settings.rows_version) != current:
+        raise ValueError(
+            f"data set '{folder}' has homes and rows of versions {settings.homes_version} and "
+            f"{settings.rows_version}; expected {current[0]} and {current[1]}: write it again with "
+            "`nrp data`"
+        )
     names = sorted(name for name in manifest["shards"] if name.startswith(split))
     if not names:
         raise ValueError(f"data set '{folder}' has no shards for '{split}' yet; run `nrp data`")
@@ -133,6 +140,13 @@ def load_dataset(folder: str | Path, split: str = "train") -> Dataset:
             parts[-1]["home"] = np.full(len(data["ratio"]), home, np.int32)
     rows = {key: np.concatenate([part[key] for part in parts]) for key in (*ROWS, "home")}
     return Dataset(settings=settings, grids=grids, rows=rows)
+
+
+def fingerprint(folder: str | Path) -> str:
+    """What names the training rows of a folder, wherever it lies."""
+    shards = _read_manifest(Path(folder))["shards"]
+    sums = [shards[name]["sha256"] for name in sorted(shards) if name.startswith("train")]
+    return hashlib.sha256("".join(sums).encode()).hexdigest()[:16]
 
 
 def home_seed(settings: Settings, split: str, index: int) -> int:
@@ -257,7 +271,8 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
         manifest = json.loads(path.read_text())
         if not {"settings", "shards"} <= manifest.keys():
             raise ValueError("settings or shards are missing")
-    except (ValueError, AttributeError) as error:
+        Settings(**manifest["settings"])
+    except (ValueError, AttributeError, TypeError) as error:
         raise ValueError(
             f"'{path}' is not readable ({error}); remove the folder and write it again"
         ) from error

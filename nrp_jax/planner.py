@@ -3,6 +3,7 @@
 import dataclasses
 import enum
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -14,7 +15,7 @@ from nrp_jax.exact import STEP, ExactScene, Verification, verify
 from nrp_jax.grid import Grid
 from nrp_jax.policies import RRT, NeuralRRT
 from nrp_jax.robots import MobileRobot
-from nrp_jax.samplers import load_sampler
+from nrp_jax.samplers import check_fits, load_sampler
 from nrp_jax.world import CarWorld, GridWorld, batch_is_free, build_world
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import into_limits
@@ -60,7 +61,7 @@ class PlanResult:
     raw_path: np.ndarray  # (P', D) as the tree has it
     cost: float  # length of ``path``: of the base's way, and a weight times that of the arm's [m]
     verification: Verification | None  # None if the goal was not reached
-    expansions: int  # lanes tried
+    expansions: int  # lanes tried, in all attempts
     rejected: Mapping[str, int]  # lanes lost, by reason
     timing: Mapping[str, float]  # compile_s, search_s, shortcut_s, verify_s
     history: np.ndarray  # (chunks + 1, 4): iteration, seconds, distance to the goal, nodes
@@ -102,7 +103,7 @@ def plan(
     """Find a collision-free path between two configurations in a home.
 
     Should the path that was found touch something between two of the planner's checks, it plans
-    again with checks twice as fine, up to twice.
+    again with checks twice as fine, up to twice, with what is left of the budgets.
 
     Args:
         robot: from :func:`nrp_jax.load_robot`.
@@ -131,28 +132,36 @@ def plan(
     goal = check_configuration(robot, world, q_goal, "goal")
     if sampler is None and method in KINDS:
         sampler = load_sampler(robot.name, KINDS[method])
+    if method in KINDS:
+        check_fits(sampler, robot, world, KINDS[method])
     make = {"goal_bias": goal_bias, "straight_rate": straight_rate, "lanes": lanes}
     policy, tree = _setup(world, start, goal, method, sampler, make, capacity)
     scene, spent = scene or ExactScene(robot, grid), {}
+    tried, rejected = 0, Counter()
     for attempt in range(ATTEMPTS):
+        left_s = time_limit_s - spent.get("search_s", 0.0)
+        if attempt and (max_expansions - tried < lanes or left_s <= 0):
+            break
         found = search(
             world,
             policy,
             tree,
             key=jax.random.fold_in(key, attempt),
-            stop=make_stop(ARRIVED, max_iterations=max(max_expansions // lanes, 1)),
-            time_limit_s=time_limit_s,
+            stop=make_stop(ARRIVED, max_iterations=max((max_expansions - tried) // lanes, 1)),
+            time_limit_s=left_s,
             on_progress=on_progress,
         )
         raw = connection_path(found.tree) if method == "rrt-connect" else tree_path(found.tree)
         reached = raw is not None and found.stopped is Stopped.REACHED
         raw = np.asarray(start)[None] if raw is None else raw
         result = _finish(scene, world, found, raw, reached, key, lanes)
+        tried += result.expansions
+        rejected.update(result.rejected)
         spent = {name: spent.get(name, 0.0) + value for name, value in result.timing.items()}
         if result.status is not Status.NOT_VERIFIED:
             break
         world = dataclasses.replace(world, resolution=world.resolution / 2)
-    return dataclasses.replace(result, timing=spent)
+    return dataclasses.replace(result, timing=spent, expansions=tried, rejected=dict(rejected))
 
 
 def check_configuration(

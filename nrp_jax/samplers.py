@@ -16,6 +16,7 @@ from nrp_jax.checkpoint import Model, build_module, check_model, load_model
 from nrp_jax.context import SIDE
 from nrp_jax.examples import RESOLUTION, describe, read, relations, surrounding_map, view
 from nrp_jax.field import FINE
+from nrp_jax.grid import HEIGHT
 from nrp_jax.models import CVAE, ModelConfig, check_choices
 from nrp_jax.robots import MobileRobot, link_features, load_robot
 from nrp_jax.world import GridWorld
@@ -41,16 +42,15 @@ class Sampler(Protocol):
 class Discriminator:
     """NRP-d: the best of many random candidates, in the eyes of the discriminator.
 
-    Half of the candidates have any posture, half one between the start's and the goal's. The goal
-    itself is one where it lies in the window. Those that stand in something solid are out
+    The candidates stand anywhere in the window, in postures between the start's and the goal's. The
+    goal itself is one where it lies in the window. Those that stand in something solid are out
     before the network looks.
     """
 
     robot: MobileRobot
     variables: Any
     config: ModelConfig = static()
-    candidates: int = static(default=500)
-    along: float = static(default=0.5)  # share of candidates with a posture between the ends'
+    candidates: int = static(default=256)  # in whole sixteens
     judged: int = static(default=96)  # most that the network looks at
     checked: int = static(default=16)  # of the best, the first whose edge seems free is taken
     edge_checks: int = static(default=12)  # configurations looked at along each of these edges
@@ -101,25 +101,16 @@ class Discriminator:
         self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Local configurations (B, C, D) and their frames (B, C, F, 3)."""
-        key_any, key_posture, key_place = jax.random.split(key, 3)
-        lanes, num_along = len(q_from), round(self.along * self.candidates / POSTURES)
-        num_any = self.candidates - num_along * POSTURES
-        # All lanes share these, so that their kinematics are computed once.
-        low, high = world.lower.at[:2].set(-REACH), world.upper.at[:2].set(REACH)
-        q = jax.random.uniform(key_any, (num_any, len(low)), minval=low, maxval=high)
-        both = (q, jax.vmap(lambda q: link_features(self.robot, q))(q))
-        anywhere = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), both)
-        if not num_along:
-            return anywhere
+        key_posture, key_place = jax.random.split(key)
+        shape = (len(q_from), round(self.candidates / POSTURES), POSTURES)
+        place = jax.random.uniform(key_place, (*shape, 2), minval=-REACH, maxval=REACH)
         q = _postures(self.robot, world, q_from, q_goal, key_posture)
         frames = jax.vmap(jax.vmap(lambda q: link_features(self.robot, q)))(q)
-        place = jax.random.uniform(
-            key_place, (lanes, num_along, POSTURES, 2), minval=-REACH, maxval=REACH
-        )
-        q = jnp.broadcast_to(q[:, None], (*place.shape[:3], q.shape[-1])).at[..., :2].set(place)
+        q = jnp.broadcast_to(q[:, None], (*shape, q.shape[-1])).at[..., :2].set(place)
         frames = frames[:, None] + jnp.pad(place, [(0, 0)] * 3 + [(0, 1)])[..., None, :]
-        along = jax.tree.map(lambda x: x.reshape(lanes, -1, *x.shape[3:]), (q, frames))
-        return jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), along, anywhere)
+        return jax.tree.map(
+            lambda x: x.reshape(len(x), shape[1] * POSTURES, *x.shape[3:]), (q, frames)
+        )
 
 
 @pytree
@@ -255,6 +246,34 @@ def load_sampler(
     model = load_model(path)
     check_model(model, path, task=task, kind=kind)
     return make_sampler(model, **settings)
+
+
+def check_fits(sampler: Any, robot: MobileRobot, world: GridWorld, kind: str) -> None:
+    """Raise a ValueError if a sampler of this module is for something else.
+
+    Args:
+        sampler: any sampler; those of other makes are trusted.
+        robot: that is planned for.
+        world: the robot in a home.
+        kind: "discriminator" or "cvae".
+    """
+    if not isinstance(sampler, Discriminator | Generator):
+        return
+    config = sampler.config
+    if (config.task, config.kind) != (robot.name, kind):
+        raise ValueError(
+            f"the sampler is the {config.kind} of '{config.task}'; expected the {kind} of "
+            f"'{robot.name}': load_sampler('{robot.name}', '{kind}')"
+        )
+    fine = FINE[2 if robot.planar else 3]
+    cell = float(world.field.step) * fine
+    layers = jax.eval_shape(features.surroundings, world.field).shape[2]
+    expected = 1 if robot.planar else round(HEIGHT / RESOLUTION)
+    if abs(cell - RESOLUTION) > 1e-6 or layers != expected:
+        raise ValueError(
+            f"the map has {layers} layers of cells of {cell:g} m; samplers have seen {expected} of "
+            f"{RESOLUTION} m: see nrp_jax.grid.coarsened and Grid.crop"
+        )
 
 
 @jax.jit

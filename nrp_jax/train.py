@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from nrp_jax import models
 from nrp_jax.checkpoint import Model, build_module, save_model
-from nrp_jax.data import load_dataset
+from nrp_jax.data import fingerprint, load_dataset
 from nrp_jax.examples import Batch, Examples, load_examples, make_batch
 from nrp_jax.journal import Keeper, State, claim, plot_curves, waited, write_log
 from nrp_jax.models import ModelConfig
@@ -272,7 +272,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
     dataset = load_dataset(arguments.data)
     soft = not arguments.hard
     examples = load_examples(config, robot, dataset, soft=soft)
-    stamp = f"{Path(arguments.data).resolve().name}, {len(dataset)} rows, soft {soft}"
+    stamp = f"{fingerprint(arguments.data)}, {len(dataset)} rows, soft {soft}"
     try:
         model = train(config, robot, examples, arguments.out, settings=settings, stamp=stamp)
     except KeyboardInterrupt:

@@ -170,7 +170,10 @@ def test_sideways_is_seen():
         ({"q_goal": np.full(8, np.nan)}, "the goal's x is nan"),
         ({"q_goal": np.r_[2.5, 1.0, START[2:]]}, "the goal touches the map"),
         ({"method": "prm"}, "unknown method 'prm'; have: rrt, rrt-is"),
-        ({"method": "nrp-g"}, "needs a sampler"),
+        (
+            {"method": "nrp-g", "sampler": nrp_jax.load_sampler("snake", "discriminator")},
+            "the sampler is the discriminator of 'snake'; expected the cvae",
+        ),
         ({"goal_bias": 2.0}, "shares in"),
     ],
 )

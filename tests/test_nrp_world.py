@@ -123,8 +123,22 @@ def test_edges_and_metric(worlds, name):
         wraps = np.asarray(world.wraps)
         apart[:, wraps] = (apart[:, wraps] + np.pi) % (2 * np.pi) - np.pi
         assert np.abs(apart).max() < 1e-3
-    halves = world.distance(q_a, world.interpolate(q_a, q_b, 0.5))
-    np.testing.assert_allclose(halves, world.distance(q_a, q_b) / 2, atol=0.01)
+    middle = world.interpolate(q_a, q_b, 0.5)
+    halves = world.distance(q_a, middle) + world.distance(middle, q_b)
+    np.testing.assert_allclose(halves, world.distance(q_a, q_b), atol=0.01)
+
+
+@pytest.mark.parametrize("name", ["snake", "fetch"])
+def test_no_joint_moves_farther_in_a_sub_step_than_the_resolution(worlds, name):
+    _, _, world = worlds[name]
+    q_a, q_b = sample_configurations(world, jax.random.key(5), 64).reshape(2, 32, -1)
+    num = np.ceil(np.asarray(world.span(world.edge(q_a, q_b))) / float(world.resolution))
+    for start, end, parts in zip(q_a, q_b, num.astype(int), strict=True):
+        fraction = np.minimum(np.arange(200) / parts, 1.0).astype(np.float32)
+        step = np.diff(world.interpolate(start[None], end[None], fraction), axis=0)
+        wraps = np.asarray(world.wraps)
+        step[:, wraps] = (step[:, wraps] + np.pi) % (2 * np.pi) - np.pi
+        assert np.abs(step).max() <= 1.01 * float(world.resolution)
 
 
 @pytest.mark.parametrize("name", ["snake", "fetch"])
