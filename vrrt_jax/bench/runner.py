@@ -16,6 +16,7 @@ from vrrt_jax.bench.methods import CAUSES, solve
 from vrrt_jax.bench.tasks import Scenery, make_task
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.command import end_with_parent
+from vrrt_jax.core.timing import machine
 from vrrt_jax.report import versions
 
 FORMAT = 1
@@ -144,7 +145,7 @@ def _key(row: dict[str, Any]) -> tuple[str, float, int]:
 
 
 def _fresh(benchmark: Benchmark) -> dict[str, Any]:
-    return {**benchmark.header(), "tasks": []}
+    return {**benchmark.header(), "machine": machine(), "tasks": []}
 
 
 def _resume(benchmark: Benchmark, file: Path) -> dict[str, Any]:

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vrrt_jax.bench.methods import CAUSES, METHODS
 from vrrt_jax.bench.tasks import ROBOTS
 
@@ -73,7 +75,9 @@ def write_page(files: Sequence[Path], folder: Path) -> Path:
     for (what, robot), group in sorted(groups.items()):
         parts += [f"## {what}: {robot}", ""]
         for results in group:
-            parts += [f"`{_command(results)}`", "", to_text(results), ""]
+            on = results.get("machine")  # older files do not tell
+            where = f" on {on['cores']} cores of {on['processor']}" if on else ""
+            parts += [f"`{_command(results)}`{where}", "", to_text(results), ""]
         name = f"{what}_{robot}.png"
         _figure(group, folder / name)
         parts += [f"![success, causes, times and path lengths]({name})", ""]
@@ -160,20 +164,22 @@ def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
     labels, stacks = [], []
     for results in group:
         for name, summary in _variants(results).items():
+            rows = results["tasks"]
+            if "by_variant" in results:
+                rows = [row for row in rows if row["variant"] == name]
             levels = summary["levels"]
+            total = sum(v["n"] for v in levels)
+            name = f"{name} (n = {total})"
             distance = [level["distance_rad"] for level in levels]
             by_level.plot(distance, [100 * v["success"] for v in levels], "o-", label=name)
             lengths.plot(
                 distance, [v["path_length"] or float("nan") for v in levels], "o-", label=name
             )
             labels.append(name)
-            total = sum(v["n"] for v in levels)
             counts = [sum(v["causes"].get(c, 0) for v in levels) for c in CAUSES]
             stacks.append([100 * count / total for count in counts])
-            rows = results["tasks"]
-            if "by_variant" in results:
-                rows = [row for row in rows if row["variant"] == name]
-            times.hist([row["time_s"] for row in rows], bins=20, histtype="step", label=name)
+            spent = sorted(row["time_s"] for row in rows)
+            times.step(spent, 100 * np.arange(1, len(spent) + 1) / len(spent), label=name)
     left = [0] * len(labels)
     for cause, colour, k in zip(CAUSES, CAUSE_COLOURS, range(len(CAUSES)), strict=True):
         width = [stack[k] for stack in stacks]
@@ -182,10 +188,13 @@ def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
     by_level.set(xlabel="distance from start to goal [rad]", ylabel="success [%]", ylim=(0, 102))
     causes.set(xlabel="failed tasks [%]", xlim=(0, 100))
     causes.invert_yaxis()
-    times.set(xlabel="planning time without compilation [s]", ylabel="tasks")
+    times.set(
+        xlabel="planning time without compilation [s]",
+        ylabel="tasks done by then [%]",
+        xscale="log",
+    )
     lengths.set(xlabel="distance from start to goal [rad]", ylabel="path length [rad]")
-    for axis in (by_level, times):
-        axis.legend(fontsize="small")
+    by_level.legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.12))
     causes.legend(fontsize="small", ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.12))
     figure.suptitle(f"{group[0]['what']}: {group[0]['robot']}")
     figure.savefig(path, dpi=110)

@@ -1,8 +1,10 @@
 """Timing on a machine that others use too: the best of many, everything in one process."""
 
+import os
 import platform
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -37,6 +39,19 @@ def interleaved_ms(functions: dict[str, Callable[[], Any]], repeats: int = 30) -
     return best
 
 
-def machine() -> dict[str, str]:
+def machine() -> dict[str, str | int]:
     """What a benchmark ran on, for its report."""
-    return {"platform": platform.platform(), "device": str(jax.devices()[0])}
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count() or 1,
+        "platform": platform.platform(),
+        "device": str(jax.devices()[0]),
+    }
+
+
+def _processor() -> str:
+    """The processor's name where Linux tells it."""
+    table = Path("/proc/cpuinfo")
+    lines = table.read_text().splitlines() if table.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
