@@ -258,6 +258,6 @@ def _draw_tree(axes, result: PlanResult, joints: tuple[int, int], names: Sequenc
     axes.plot(*path[-1], "*", color="tab:red", ms=11)
     axes.set_xlabel(f"{names[joints[0]]} [rad]")
     axes.set_ylabel(f"{names[joints[1]]} [rad]")
-    axes.set_title("trees, darker where the loss is lower; path to the star", fontsize=9)
+    axes.set_title("trees (bright: low loss) and path", fontsize=10)
     axes.autoscale()
     axes.grid(alpha=0.3)
