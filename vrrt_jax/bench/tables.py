@@ -105,7 +105,8 @@ def _label(results: dict[str, Any]) -> str:
     method = results["variants"][0]["method"]
     if method != "vrrt":
         return method
-    return "vrrt, paper's settings" if _is_paper(results) else "vrrt, default"
+    views = ", two views" if results["scenery"]["views"] == 2 else ""
+    return ("vrrt, paper's settings" if _is_paper(results) else "vrrt, default") + views
 
 
 def _is_paper(results: dict[str, Any]) -> bool:
