@@ -124,8 +124,7 @@ def rrt_is(world: GridWorld, q_start: jax.Array, q_goal: jax.Array, key: jax.Arr
         among = (jnp.arange(_CAPACITY) < size)[None]
         nearest = nodes[jnp.argmin(world.distances(nodes, target[None], among)[0])]
         edge = world.edge(nearest, target)
-        num = 1 + jnp.sum(~jax.vmap(lambda n: world.checkable(edge, n))(step))
-        num = jnp.minimum(num, _SUB_STEPS)
+        num = jnp.minimum(world.parts(edge, _SUB_STEPS), _SUB_STEPS)
         points = jax.vmap(
             lambda f: world.normalise(world.end(nearest, world.part(edge, f)))
         )(step / num)  # fmt: skip

@@ -70,7 +70,6 @@ def verify(
     *,
     lower: np.ndarray,
     upper: np.ndarray,
-    turning_radius: float | None = None,
 ) -> Verification:
     """Check a fine trajectory: limits, steps, how the base may roll, and contacts.
 
@@ -79,10 +78,9 @@ def verify(
         trajectory: (T, D) configurations, no farther apart than 0.02 m or rad.
         lower: (D,) limits; those of joints that turn for ever are not looked at.
         upper: (D,) limits.
-        turning_radius: of a base that drives like a car [m], None for one that slides.
     """
     trajectory = np.asarray(trajectory, np.float64)
-    problem = _motion_problem(scene.robot, trajectory, lower, upper, turning_radius)
+    problem = _motion_problem(scene.robot, trajectory, lower, upper)
     for index, q in enumerate(trajectory):
         if contact := problem or scene.touching(q):
             share = 100 * index / max(len(trajectory) - 1, 1)
@@ -96,7 +94,6 @@ def _motion_problem(
     trajectory: np.ndarray,
     lower: np.ndarray,
     upper: np.ndarray,
-    turning_radius: float | None,
 ) -> str | None:
     """What is wrong with a trajectory (T, D) before anything is touched."""
     if not np.isfinite(trajectory).all():
@@ -110,7 +107,7 @@ def _motion_problem(
     step[:, wraps] = (step[:, wraps] + np.pi) % (2 * np.pi) - np.pi
     if (np.abs(step) > STEP * 1.01 + 1e-4).any():
         return f"the path has a gap of {np.abs(step).max():.3f}"
-    if turning_radius is None:
+    if robot.base_dim == 2:  # it slides; one that turns drives like a car
         return None
     middle = trajectory[:-1, 2] + step[:, 2] / 2
     sideways = np.abs(step[:, 1] * np.cos(middle) - step[:, 0] * np.sin(middle))

@@ -15,13 +15,11 @@ from nrp_jax import context, features
 from nrp_jax.data import Dataset
 from nrp_jax.expert import POSITIVE
 from nrp_jax.field import Field, make_field
-from nrp_jax.grid import Grid
+from nrp_jax.grid import RESOLUTION, Grid
 from nrp_jax.houses import CELLS
 from nrp_jax.models import ModelConfig
 from nrp_jax.robots import MobileRobot, link_features
 from vrrt_jax.core.types import pytree
-
-RESOLUTION = 0.1  # side of a cell, in all that the models have seen [m]
 
 
 @pytree

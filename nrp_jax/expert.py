@@ -221,8 +221,7 @@ def _halvings():
 def _prepare(world: GridWorld, nodes: jax.Array, a: jax.Array, b: jax.Array):
     q_from = nodes[a]
     edge = world.edge(q_from, nodes[b])
-    enough = jax.vmap(world.checkable, (None, 0))(edge, jnp.arange(1, 2**_LEVELS + 1))
-    return q_from, edge, world.length(edge), 1 + jnp.sum(~enough, axis=0)
+    return q_from, edge, world.length(edge), world.parts(edge, 2**_LEVELS)
 
 
 def _survivors(

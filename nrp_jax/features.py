@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nrp_jax.field import FINE, Field
+from nrp_jax.field import Field
 from nrp_jax.models import ModelConfig
 from nrp_jax.robots import MobileRobot
 from vrrt_jax.core.edges import short_way
@@ -122,7 +122,7 @@ def surroundings(field: Field) -> jax.Array:
     Distances beyond ``CLEAR`` count as that; solid cells hold 0.
     """
     planar = field.values.shape[2] == 1
-    fine = FINE[2 if planar else 3]
+    fine = field.fine
     first = fine + fine // 2  # the field has a rim of one cell in x and y
     inside = field.values[first:-first:fine, first:-first:fine]
     return jnp.minimum(inside if planar else inside[:, :, fine // 2 :: fine], CLEAR)

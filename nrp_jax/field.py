@@ -24,6 +24,16 @@ class Field:
     origin: jax.Array  # (3,) position of the first lattice point [m]
     step: jax.Array  # () between lattice points [m]
 
+    @property
+    def fine(self) -> int:
+        """Lattice steps a cell."""
+        return FINE[2 if self.values.shape[2] == 1 else 3]
+
+    @property
+    def resolution(self) -> jax.Array:
+        """() side of a cell [m]."""
+        return self.step * self.fine
+
 
 def make_field(grid: Grid) -> Field:
     """The field of a map, with a rim of one solid cell around it in x and y.

@@ -16,7 +16,7 @@ from nrp_jax.grid import Grid
 from nrp_jax.policies import RRT, NeuralRRT
 from nrp_jax.robots import MobileRobot
 from nrp_jax.samplers import check_fits, load_sampler
-from nrp_jax.world import CarWorld, GridWorld, batch_is_free, build_world
+from nrp_jax.world import GridWorld, batch_is_free, build_world
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import into_limits
 from vrrt_jax.core.rrt import RRTConnect, connection_path, tree_path
@@ -130,16 +130,15 @@ def plan(
     world = build_world(robot, grid) if world is None else world
     start = check_configuration(robot, world, q_start, "start")
     goal = check_configuration(robot, world, q_goal, "goal")
-    if sampler is None and method in KINDS:
-        sampler = load_sampler(robot.name, KINDS[method])
     if method in KINDS:
+        sampler = load_sampler(robot.name, KINDS[method]) if sampler is None else sampler
         check_fits(sampler, robot, world, KINDS[method])
     make = {"goal_bias": goal_bias, "straight_rate": straight_rate, "lanes": lanes}
     policy, tree = _setup(world, start, goal, method, sampler, make, capacity)
-    scene, spent = scene or ExactScene(robot, grid), {}
-    tried, rejected = 0, Counter()
+    scene = scene or ExactScene(robot, grid)
+    tried, spent, rejected = 0, Counter(), Counter()
     for attempt in range(ATTEMPTS):
-        left_s = time_limit_s - spent.get("search_s", 0.0)
+        left_s = time_limit_s - spent["search_s"]
         if attempt and (max_expansions - tried < lanes or left_s <= 0):
             break
         found = search(
@@ -156,12 +155,14 @@ def plan(
         raw = np.asarray(start)[None] if raw is None else raw
         result = _finish(scene, world, found, raw, reached, key, lanes)
         tried += result.expansions
+        spent.update(result.timing)
         rejected.update(result.rejected)
-        spent = {name: spent.get(name, 0.0) + value for name, value in result.timing.items()}
         if result.status is not Status.NOT_VERIFIED:
             break
         world = dataclasses.replace(world, resolution=world.resolution / 2)
-    return dataclasses.replace(result, timing=spent, expansions=tried, rejected=dict(rejected))
+    return dataclasses.replace(
+        result, timing=dict(spent), expansions=tried, rejected=dict(rejected)
+    )
 
 
 def check_configuration(
@@ -281,7 +282,6 @@ def _finish(
             trajectory,
             lower=np.asarray(world.lower),
             upper=np.asarray(world.upper),
-            turning_radius=float(world.radius) if isinstance(world, CarWorld) else None,
         )
     clock.append(time.perf_counter())
     if verification is not None:

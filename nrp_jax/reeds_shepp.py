@@ -59,11 +59,17 @@ def curve_length(curve: Curve) -> jax.Array:
     return sum((jnp.abs(drive) for drive in curve.drive[1:]), jnp.abs(curve.drive[0]))
 
 
-def extents(curve: Curve, radius: jax.Array | float) -> list[jax.Array]:
-    """How far the pieces of curves go, 5 of (...): the way [m], or the turn [rad] if that is more.
+def extent(curve: Curve, radius: jax.Array | float) -> jax.Array:
+    """How far curves go (...): of each piece the way [m], or the turn [rad] if that is more.
 
     On a tight arc a short way is a large turn, which sweeps whatever the robot holds out.
     """
+    pieces = _extents(curve, radius)
+    return sum(pieces[1:], pieces[0])
+
+
+def _extents(curve: Curve, radius: jax.Array | float) -> list[jax.Array]:
+    """Those of the pieces, 5 of (...)."""
     tight = jnp.maximum(radius, 1.0)
     return [
         jnp.abs(drive) * jnp.where(turn == 0, radius, tight)
@@ -72,10 +78,9 @@ def extents(curve: Curve, radius: jax.Array | float) -> list[jax.Array]:
 
 
 def cut(curve: Curve, fraction: jax.Array, radius: jax.Array | float) -> Curve:
-    """The first fraction (...) of curves, of their :func:`extents`."""
-    sizes, drives = extents(curve, radius), []
-    left = fraction * sum(sizes[1:], sizes[0])
-    for drive, size in zip(curve.drive, sizes, strict=True):
+    """The first fraction (...) of curves, of their :func:`extent`."""
+    left, drives = fraction * extent(curve, radius), []
+    for drive, size in zip(curve.drive, _extents(curve, radius), strict=True):
         drives.append(drive * jnp.clip(left / jnp.maximum(size, 1e-12), 0.0, 1.0))
         left = left - size
     turns = tuple(jnp.broadcast_to(turn, left.shape) for turn in curve.turn)

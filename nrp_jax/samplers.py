@@ -14,9 +14,8 @@ import jax.numpy as jnp
 from nrp_jax import features
 from nrp_jax.checkpoint import Model, build_module, check_model, load_model
 from nrp_jax.context import SIDE
-from nrp_jax.examples import RESOLUTION, describe, read, relations, surrounding_map, view
-from nrp_jax.field import FINE
-from nrp_jax.grid import HEIGHT
+from nrp_jax.examples import describe, read, relations, surrounding_map, view
+from nrp_jax.grid import HEIGHT, RESOLUTION
 from nrp_jax.models import CVAE, ModelConfig, check_choices
 from nrp_jax.robots import MobileRobot, link_features, load_robot
 from nrp_jax.world import GridWorld
@@ -155,8 +154,7 @@ def _look(
     config: ModelConfig, robot: MobileRobot, world: GridWorld, q_from: jax.Array, q_goal: jax.Array
 ) -> _Sight:
     padded = surrounding_map(config, world.field)
-    fine = FINE[2 if robot.planar else 3]
-    resolution = world.field.step * fine
+    resolution = world.field.resolution
     origin = world.field.origin[:2] + resolution  # the field has a rim of one cell
     image, centre = jax.vmap(lambda q: view(config, padded, q, resolution, origin))(q_from)
     ends = jnp.stack([q_from, q_goal], axis=1)
@@ -265,8 +263,7 @@ def check_fits(sampler: Any, robot: MobileRobot, world: GridWorld, kind: str) ->
             f"the sampler is the {config.kind} of '{config.task}'; expected the {kind} of "
             f"'{robot.name}': load_sampler('{robot.name}', '{kind}')"
         )
-    fine = FINE[2 if robot.planar else 3]
-    cell = float(world.field.step) * fine
+    cell = float(world.field.resolution)
     layers = jax.eval_shape(features.surroundings, world.field).shape[2]
     expected = 1 if robot.planar else round(HEIGHT / RESOLUTION)
     if abs(cell - RESOLUTION) > 1e-6 or layers != expected:

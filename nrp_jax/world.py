@@ -1,6 +1,7 @@
 """A robot in a home: is this configuration free, how far is it to that one, and on which way."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -88,6 +89,11 @@ class GridWorld(Straight):
         """See :class:`vrrt_jax.core.edges.Space`."""
         return self.span(edge) <= num_steps * self.resolution * (1 + 1e-5)
 
+    def parts(self, edge: Any, most: int) -> jax.Array:
+        """Fewest parts (...) of an edge that are checkable each; ``most + 1`` if it takes more."""
+        enough = jax.vmap(self.checkable, (None, 0))(edge, jnp.arange(1, most + 1))
+        return 1 + jnp.sum(~enough, axis=0)
+
 
 @pytree
 class CarEdge:
@@ -157,8 +163,8 @@ class CarWorld(GridWorld):
 
     def span(self, edge: CarEdge) -> jax.Array:
         """The longest way (...) of base, with what it turns, or any joint [m] or [rad]."""
-        pieces = reeds_shepp.extents(edge.curve, self.radius)
-        return jnp.maximum(sum(pieces[1:], pieces[0]), jnp.max(jnp.abs(edge.arm), axis=-1))
+        base = reeds_shepp.extent(edge.curve, self.radius)
+        return jnp.maximum(base, jnp.max(jnp.abs(edge.arm), axis=-1))
 
     def end(self, q_from: jax.Array, edge: CarEdge) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`; the whole edge ends at its target exactly."""

@@ -10,7 +10,8 @@ from nrp_synthetic import random_grid
 
 from nrp_jax import context, features, models
 from nrp_jax.checkpoint import Model, build_module, check_model, load_model, save_model
-from nrp_jax.examples import RESOLUTION, relations, surrounding_map, view
+from nrp_jax.examples import relations, surrounding_map, view
+from nrp_jax.grid import RESOLUTION
 from nrp_jax.models import ModelConfig
 from nrp_jax.robots import link_features, load_robot
 from nrp_jax.world import build_world, is_free

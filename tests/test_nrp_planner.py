@@ -158,7 +158,7 @@ def test_sideways_is_seen():
     slide[:, :2], slide[:, 3] = 3.0, 0.2
     slide[:, 1] += 0.02 * np.arange(5)
     lower, upper = np.full(11, -9.0), np.full(11, 9.0)
-    found = verify(ExactScene(fetch, grid), slide, lower=lower, upper=upper, turning_radius=0.1)
+    found = verify(ExactScene(fetch, grid), slide, lower=lower, upper=upper)
     assert "sideways" in found.problem
 
 

@@ -124,8 +124,10 @@ def test_edges_and_metric(worlds, name):
         apart[:, wraps] = (apart[:, wraps] + np.pi) % (2 * np.pi) - np.pi
         assert np.abs(apart).max() < 1e-3
     middle = world.interpolate(q_a, q_b, 0.5)
-    halves = world.distance(q_a, middle) + world.distance(middle, q_b)
-    np.testing.assert_allclose(halves, world.distance(q_a, q_b), atol=0.01)
+    first, second = world.distance(q_a, middle), world.distance(middle, q_b)
+    np.testing.assert_allclose(first + second, world.distance(q_a, q_b), atol=0.01)
+    if name == "snake":  # the Fetch's edges are cut by how far they go or turn
+        np.testing.assert_allclose(first, world.distance(q_a, q_b) / 2, atol=0.01)
 
 
 @pytest.mark.parametrize("name", ["snake", "fetch"])

@@ -120,12 +120,12 @@ def test_interpolation_is_continuous_and_keeps_to_the_shortest_way(rng):
         assert np.abs(turned(path[:, end, 2] - pose[:, 2])).max() < 1e-3
     step = np.diff(path, axis=1)
     curve = jax.jit(lambda a, b: reeds_shepp.shortest(a, b, RADIUS))(a, b)
-    longest = np.asarray(sum(reeds_shepp.extents(curve, RADIUS)))[:, None] / 200 + 1e-3
+    longest = np.asarray(reeds_shepp.extent(curve, RADIUS))[:, None] / 200
     turn = sum(np.abs(d) * (t != 0) for d, t in zip(curve.drive, curve.turn, strict=True))
-    assert np.all(longest >= np.asarray(turn)[:, None] / 200)
+    assert np.all(longest >= np.asarray(turn)[:, None] / 200 - 1e-6)
     # Neither the way nor the turn of a step is longer than its share of the extents.
-    assert np.all(np.linalg.norm(step[..., :2], axis=2) <= longest)
-    assert np.all(np.abs(turned(step[..., 2])) <= longest)
+    assert np.all(np.linalg.norm(step[..., :2], axis=2) <= longest + 1e-4)
+    assert np.all(np.abs(turned(step[..., 2])) <= longest + 1e-3)
     middle = path[:, 80]
     np.testing.assert_allclose(length(a, middle) + length(middle, b), total, atol=5e-3)
 

@@ -150,8 +150,9 @@ def _fresh(benchmark: Benchmark) -> dict[str, Any]:
 
 def _resume(benchmark: Benchmark, file: Path) -> dict[str, Any]:
     if not file.exists():
-        _write(file, _fresh(benchmark))  # a bad path is told before hours of work
-        return _fresh(benchmark)
+        results = _fresh(benchmark)
+        _write(file, results)  # a bad path is told before hours of work
+        return results
     try:
         results = json.loads(file.read_text())
         old = {name: results[name] for name in benchmark.header()}

@@ -101,7 +101,7 @@ class Straight:
         """See :class:`Space`."""
         return difference(self, q_from, q_to)
 
-    def steer(self, q_from: jax.Array, target: jax.Array, num_steps: int | jax.Array) -> jax.Array:
+    def steer(self, q_from: jax.Array, target: jax.Array, num_steps: int) -> jax.Array:
         """See :class:`Space`."""
         return steer(self, q_from, target, num_steps * self.resolution)
 
