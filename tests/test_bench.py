@@ -90,17 +90,19 @@ def _attempt(**changes):
 
 
 @pytest.mark.parametrize(
-    ("changes", "right", "valid", "cause"),
+    ("changes", "judged", "cause"),
     [
-        ({"matched": False}, False, True, "no match found"),
-        ({}, False, True, "matched the wrong pose"),
-        ({"has_path": False}, True, True, "right pose, no path"),
-        ({"out_of_time": True}, True, True, "out of time"),
-        ({}, True, False, "invalid path"),
+        ({"matched": False}, {}, "no match found"),
+        ({}, {}, "matched the wrong pose"),
+        ({}, {"alike": True}, "wrong pose that looks the same"),
+        ({"has_path": False}, {"right": True, "alike": True}, "right pose, no path"),
+        ({"out_of_time": True}, {"right": True}, "out of time"),
+        ({}, {"right": True, "valid": False}, "invalid path"),
     ],
 )
-def test_causes(changes, right, valid, cause):
-    assert methods._cause(_attempt(**changes), right=right, valid=valid) == cause
+def test_causes(changes, judged, cause):
+    judged = {"right": False, "valid": True, "alike": False} | judged
+    assert methods._cause(_attempt(**changes), **judged) == cause
     assert cause in methods.CAUSES
 
 
@@ -127,11 +129,10 @@ def test_results_stream_resume_and_are_not_mixed(tmp_path, monkeypatch):
     for other in ({"seed": 4}, {"method": "prof-robot"}, {"time_limit_s": 5.0}):
         with pytest.raises(ValueError, match="not mixed"):
             runner.run(_benchmark(**other), file)
-    changed = json.loads(file.read_text())
-    changed["versions"]["jax"] = "0.0"
-    file.write_text(json.dumps(changed))
-    with pytest.raises(ValueError, match="not mixed"):
-        runner.run(_benchmark(), file)
+    for other in ({"versions": {"jax": "0.0"}}, {"self_model": "of another training"}):
+        file.write_text(json.dumps(results | other))
+        with pytest.raises(ValueError, match="not mixed"):
+            runner.run(_benchmark(), file)
 
 
 def test_full_disk_keeps_what_was_done(tmp_path, monkeypatch):
@@ -156,6 +157,7 @@ def test_summary():
         "cause": "",
         "time_s": 1.0,
         "path_length": 2.0,
+        "path_over_reference": 1.1,
         "mean_error_rad": 0.01,
         "psnr_db": 30.0,
         "straight_is_blocked": False,
@@ -166,7 +168,7 @@ def test_summary():
     level = summary["levels"][0]
     assert (level["n"], level["success"], level["median_time_s"]) == (2, 0.5, 2.0)
     assert level["causes"] == {"no match found": 1}
-    assert level["path_length"] == 2.0  # of solved tasks
+    assert (level["path_length"], level["path_over_reference"]) == (2.0, 1.1)  # of solved tasks
 
 
 def test_unknown_names_list_the_known(capsys):

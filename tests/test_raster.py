@@ -233,6 +233,37 @@ def test_a_near_splat_tints_far_ones_outside_a_narrow_window_too():
     np.testing.assert_allclose(cut, whole, atol=WINDOW_TOLERANCE)
 
 
+def test_a_layer_hides_another_only_as_far_as_it_covers():
+    """Where the near splat is faint the far one keeps its colour, and behind it none is left."""
+    model = splats([[1.0, 0.0, 0.0], [1.5, 0.0, 0.0]], [[1, 0, 0], [0, 1, 0]], radius=(0.02, 0.09))
+    model = dataclasses.replace(model, density=jnp.array([9.0, 3.0]), shade=jnp.zeros((2, 3)))
+
+    def image(model):
+        rgb, coverage = jax.jit(lambda p: render(model, p, ahead()))(jnp.eye(4)[None])
+        return np.asarray(rgb), np.asarray(coverage)
+
+    one, coverage = image(model)
+    two, covered_by_both = image(dataclasses.replace(model, starts=(0, 1)))
+    far = dataclasses.replace(model, density=jnp.array([0.0, 3.0]))
+    near = dataclasses.replace(model, density=jnp.array([9.0, 0.0]))
+    near_coverage, far_coverage = image(near)[1], image(far)[1]
+    np.testing.assert_allclose(covered_by_both, coverage, atol=FLOAT32_TOLERANCE)
+    np.testing.assert_allclose(two[..., 0], near_coverage, atol=0.01)
+    np.testing.assert_allclose(two[..., 1], (1 - near_coverage) * far_coverage, atol=0.01)
+    edge = (near_coverage > 0.001) & (near_coverage < 0.05)
+    assert np.all(one[edge, 0] > 0.9 * coverage[edge])  # a single layer paints it all over
+
+
+def test_the_order_of_layers_does_not_matter():
+    model = splats([[1.0, 0.0, 0.0], [1.5, 0.02, 0.0]], [[1, 0, 0], [0, 1, 0]], radius=0.05)
+    model = dataclasses.replace(model, starts=(0, 1))
+    turned = jax.tree.map(lambda a: a[::-1] if a.ndim else a, model)
+    picture, expected = (
+        jax.jit(lambda p, m=m: render(m, p, ahead())[0])(jnp.eye(4)[None]) for m in (turned, model)
+    )
+    np.testing.assert_allclose(picture, expected, atol=FLOAT32_TOLERANCE)
+
+
 def test_clusters_are_the_same_splats_of_one_link_each(panda, panda_splats, panda_camera, panda_q):
     poses = jax.vmap(lambda q: link_poses(panda.chain, q))(panda_q)
     model, windows = choose_windows(panda_splats, poses, panda_camera)

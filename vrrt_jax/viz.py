@@ -1,5 +1,6 @@
 """Figures and animations of plans."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -71,14 +72,8 @@ def _splat_layers(splats: SplatModel, robot: Robot, camera: Camera, q: jax.Array
     pose = poses[splats.link]
     points = jnp.einsum("gij,gj->gi", pose[:, :3, :3], splats.mean) + pose[:, :3, 3]
     _, depth = project(camera, points)
-    as_colour = SplatModel(
-        mean=splats.mean,
-        radius=splats.radius,
-        density=splats.density,
-        rgb=jnp.repeat(depth[:, None], 3, axis=1),
-        shade=jnp.zeros_like(splats.shade),
-        link=splats.link,
-        tau=splats.tau,
+    as_colour = dataclasses.replace(
+        splats, rgb=jnp.repeat(depth[:, None], 3, axis=1), shade=jnp.zeros_like(splats.shade)
     )
     weighted, _ = render(as_colour, poses, camera)
     return rgb, coverage, weighted[..., 0] / jnp.maximum(coverage, 1e-3)

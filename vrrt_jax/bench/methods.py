@@ -23,8 +23,9 @@ from vrrt_jax.bench.tasks import (
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.types import Status
 from vrrt_jax.core.verify import verify_path
-from vrrt_jax.core.world import obstacle_list
+from vrrt_jax.core.world import World, obstacle_list
 from vrrt_jax.problems import self_model_path
+from vrrt_jax.robots.robot import Robot
 from vrrt_jax.splat.model import SelfModel, load_self_model
 
 METHODS = ("vrrt", "dr-robot", "prof-robot", "dr-robot-rrt-star")
@@ -33,6 +34,7 @@ SUCCESS_RAD = 0.05  # mean joint error, as in the paper
 CAUSES = (
     "no match found",
     "matched the wrong pose",
+    "wrong pose that looks the same",
     "right pose, no path",
     "out of time",
     "invalid path",
@@ -92,10 +94,11 @@ def solve(
     images, masks = goal_images(robot_name, task, scenery)
     task_seed = zlib.crc32(f"{seed} {task.level:.3f} {task.index}".encode())
     key = jax.random.key(task_seed)
+    self_model = _self_model(robot_name)
     inputs = (
         robot,
         world,
-        _self_model(robot_name),
+        self_model,
         cameras(robot_name, scenery),
         images,
         task.q_start,
@@ -114,9 +117,14 @@ def solve(
     right = bool(error.mean() < SUCCESS_RAD)
     valid = not collisions or verify_path(robot, obstacle_list(world), attempt.path).ok
     success = right and valid and attempt.has_path
+    psnr_db = image_psnr(robot_name, attempt.path[-1], images, scenery)
     cause = ""
     if not success:
-        cause = _cause(attempt, right=right, valid=valid)
+        # The meshes look more alike in the two poses than the self-model is like the meshes.
+        alike = psnr_db >= self_model.level_for(config.polish_px).psnr_db
+        cause = _cause(attempt, right=right, valid=valid, alike=alike)
+    length = _length(world, attempt.path)
+    reference = _reference_length(robot, world, task, key) if success and collisions else None
     return {
         "level": task.level,
         "index": task.index,
@@ -127,24 +135,33 @@ def solve(
         "mean_error_rad": round(float(error.mean()), 5),
         "max_error_rad": round(float(error.max()), 5),
         "l2_error_rad": round(float(np.linalg.norm(error)), 5),
-        "path_length": round(_length(world, attempt.path), 4),
+        "path_length": round(length, 4),
+        "path_over_reference": round(length / reference, 4) if reference else None,
         "loss": float(f"{attempt.loss:.4g}"),
-        "psnr_db": round(image_psnr(robot_name, attempt.path[-1], images, scenery), 2),
+        "psnr_db": round(psnr_db, 2),
         "time_s": round(attempt.search_s, 3),
         "wall_s": round(wall_s, 2),
     }
 
 
-def _length(world, path: np.ndarray) -> float:
+def _length(world: World, path: np.ndarray) -> float:
     steps = [joint_error(world, a, b) for a, b in zip(path, path[1:], strict=False)]
     return float(sum(np.linalg.norm(step) for step in steps))
 
 
-def _cause(attempt: Attempt, *, right: bool, valid: bool) -> str:
+def _reference_length(robot: Robot, world: World, task: Task, key: jax.Array) -> float | None:
+    """Of RRT-Connect's shortened path to the true goal, if it finds one."""
+    found = planner.plan_to_configuration(robot, world, task.q_start, task.q_goal, key=key)
+    return _length(world, found.path) if found.ok else None
+
+
+def _cause(attempt: Attempt, *, right: bool, valid: bool, alike: bool) -> str:
     if attempt.out_of_time:
         return "out of time"
     if right:
         return "invalid path" if attempt.has_path and not valid else "right pose, no path"
+    if alike:
+        return "wrong pose that looks the same"
     return "matched the wrong pose" if attempt.matched else "no match found"
 
 

@@ -13,7 +13,7 @@ from vrrt_jax.splat.camera import look_at
 from vrrt_jax.splat.loss import image_loss
 from vrrt_jax.splat.raster import choose_windows, map_lanes, render
 from vrrt_jax.splat.reference import render_reference
-from vrrt_jax.splat.types import SplatModel
+from vrrt_jax.splat.types import SplatModel, layer_starts
 
 CHANNELS = 5  # what the rasterizer sums: weighted rgb, weight and density
 
@@ -89,8 +89,10 @@ def random_splats(robot: Robot, num_splats: int, rng: np.random.Generator) -> Sp
         "rgb": rng.uniform(size=(num_splats, 3)),
         "shade": 0.2 * normal,
     }
+    link = np.asarray(cover.link)[sphere]
     return SplatModel(
-        link=jnp.asarray(np.asarray(cover.link)[sphere], jnp.int32),
+        link=jnp.asarray(link, jnp.int32),
+        starts=layer_starts(link),
         tau=jnp.float32(0.04),
         **{name: jnp.asarray(value, jnp.float32) for name, value in arrays.items()},
     )

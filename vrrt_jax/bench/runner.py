@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import dataclasses
+import hashlib
 import json
 import multiprocessing
 import os
@@ -13,13 +14,14 @@ import numpy as np
 from tqdm import tqdm
 
 from vrrt_jax.bench.methods import CAUSES, solve
-from vrrt_jax.bench.tasks import Scenery, make_task
+from vrrt_jax.bench.tasks import Scenery, bench_robot, make_task
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.command import end_with_parent
 from vrrt_jax.core.timing import machine
+from vrrt_jax.problems import self_model_path
 from vrrt_jax.report import versions
 
-FORMAT = 1
+FORMAT = 2
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -57,6 +59,7 @@ class Benchmark:
             "scenery": dataclasses.asdict(self.scenery),
             "variants": [_plain(dataclasses.asdict(variant)) for variant in self.variants],
             "versions": versions(),
+            "self_model": _fingerprint(self_model_path(bench_robot(self.robot))),
         }
 
 
@@ -208,6 +211,9 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
                 "median_time_s": _median(row["time_s"] for row in own),
                 "p95_time_s": round(float(np.quantile([row["time_s"] for row in own], 0.95)), 2),
                 "path_length": _mean(row["path_length"] for row in won),
+                "path_over_reference": _median(
+                    row["path_over_reference"] for row in won if row["path_over_reference"]
+                ),
                 "mean_error_rad": _mean(row["mean_error_rad"] for row in own),
                 "median_psnr_db": _median(row["psnr_db"] for row in own),
                 "straight_is_blocked": _mean(row["straight_is_blocked"] for row in own),
@@ -226,8 +232,14 @@ def _mean(values) -> float | None:
     return round(float(np.mean(values)), 4) if values else None
 
 
-def _median(values) -> float:
-    return round(float(np.median(list(values))), 3)
+def _median(values) -> float | None:
+    values = list(values)
+    return round(float(np.median(values)), 3) if values else None
+
+
+def _fingerprint(file: Path) -> str:
+    """Of what is in a file."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()[:12]
 
 
 def _plain(fields: dict[str, Any]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ PAPER_NOTE = (
     "The paper's numbers are its own: other worlds, tasks and self-models, 100 tasks a level, on "
     "an NVIDIA RTX 4090; 21.6 s a plan for the Panda."
 )
-CAUSE_COLOURS = ("#4878a8", "#d9903d", "#8a8a8a", "#7a5aa6", "#b5433f")
+CAUSE_COLOURS = ("#4878a8", "#d9903d", "#ecc68f", "#8a8a8a", "#7a5aa6", "#b5433f")
 
 
 def to_text(results: dict[str, Any]) -> str:
@@ -38,6 +38,9 @@ def to_text(results: dict[str, Any]) -> str:
                     f"{level['median_time_s']:.2f}",
                     f"{level['p95_time_s']:.2f}",
                     "" if level["path_length"] is None else f"{level['path_length']:.2f}",
+                    f"{level['path_over_reference']:.2f}"
+                    if level.get("path_over_reference")
+                    else "",
                     f"{level['mean_error_rad']:.3f}",
                     f"{level['median_psnr_db']:.1f}",
                     causes,
@@ -45,7 +48,7 @@ def to_text(results: dict[str, Any]) -> str:
             )
         if len(summary["levels"]) > 1:
             average = _percent(summary["average_success"])
-            rows.append([name, "average", "", average, *[""] * 6])
+            rows.append([name, "average", "", average, *[""] * 7])
     heads = (
         "method",
         "level [rad]",
@@ -54,6 +57,7 @@ def to_text(results: dict[str, Any]) -> str:
         "median time [s]",
         "95 % [s]",
         "path [rad]",
+        "of RRT-Connect's to the true goal",
         "mean error [rad]",
         "PSNR [dB]",
         "causes of failure",

@@ -26,7 +26,7 @@ from vrrt_jax.splat.loss import image_loss, psnr_db
 from vrrt_jax.splat.model import Level, SelfModel, save_self_model
 from vrrt_jax.splat.mujoco_images import MeshRenderer
 from vrrt_jax.splat.raster import render
-from vrrt_jax.splat.types import Camera, SplatModel
+from vrrt_jax.splat.types import Camera, SplatModel, layer_starts
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -275,6 +275,7 @@ def initial_splats(points: np.ndarray, num_splats: int, seed: int) -> SplatModel
         link += [index] * num
     radius = np.clip(radius, 0.002, 0.05)
     return SplatModel(
+        starts=layer_starts(np.array(link)),
         mean=jnp.asarray(mean, jnp.float32),
         radius=jnp.asarray(radius, jnp.float32),
         density=jnp.full(num_splats, 3.0, jnp.float32),

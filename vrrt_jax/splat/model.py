@@ -11,7 +11,7 @@ import numpy as np
 
 from vrrt_jax.splat.types import SplatModel
 
-FORMAT = 1
+FORMAT = 2
 ARRAYS = ("mean", "radius", "density", "rgb", "shade", "link", "tau")
 
 
@@ -51,7 +51,12 @@ def save_self_model(model: SelfModel, path: str | Path) -> None:
         "seed": model.seed,
         "info": model.info,
         "levels": [
-            {"size_px": v.size_px, "psnr_db": v.psnr_db, "match_bar": v.match_bar}
+            {
+                "size_px": v.size_px,
+                "psnr_db": v.psnr_db,
+                "match_bar": v.match_bar,
+                "starts": v.splats.starts,
+            }
             for v in model.levels
         ],
     }
@@ -98,7 +103,8 @@ def load_self_model(path: str | Path) -> SelfModel:
                         arrays[f"{i}/{name}"], jnp.int32 if name == "link" else jnp.float32
                     )
                     for name in ARRAYS
-                }
+                },
+                starts=tuple(numbers.pop("starts")),
             ),
             **numbers,
         )

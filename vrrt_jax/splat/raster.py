@@ -3,7 +3,10 @@
 The footprint of an isotropic Gaussian is a row profile times a column profile, so the sum of all
 splats' features over the image is one product of matrices, and its gradient two more. There is no
 sort, no tile and no cut-off: every splat keeps a gradient. Occlusion is a soft z-buffer: colours
-are averaged with weights that fall off with depth behind the nearest splat.
+are averaged with weights that fall off with depth behind the nearest splat. As a near splat then
+outshines far ones even where it is faint, silhouettes before the robot's own body would grow. So
+links are drawn in layers, an arm apart from its base, say, and a layer hides another where it is
+in front and only as far as it covers.
 
 On a CPU most of those products multiply by zero. With :func:`choose_windows` neighbouring splats
 are summed over a small window of the image, and the windows are added. Neighbours that do not fit
@@ -49,6 +52,14 @@ class _Splats(NamedTuple):
     features: jax.Array  # (C, G)
 
 
+class _Layout(NamedTuple):
+    """What is the same in every lane."""
+
+    size: tuple[int, int]  # height and width of the image
+    starts: tuple[int, ...]  # first splat of each layer
+    windows: Windows | None
+
+
 class _Places(NamedTuple):
     """Where the windows of an image are."""
 
@@ -70,15 +81,15 @@ def render(
     Returns:
         rgb (H, W, 3), the robot over black, and coverage (H, W).
     """
-    size = (camera.height, camera.width)
+    layout = _Layout((camera.height, camera.width), model.starts, windows)
     splats, depth = _project(model, poses, camera)
     places = None
     if windows is not None:
-        low, high = _extents(splats, depth, model.tau, windows.cluster, size)
+        low, high = _extents(splats, depth, model.tau, layout, windows.cluster)
         room = jnp.array([[camera.width - windows.px], [camera.height - windows.px]])
         corner = jnp.minimum(low, room)
         places = _Places(corner, jnp.all(high <= corner + windows.px, axis=0))
-    rgb, coverage = _composite(_image(splats, places, size, windows))
+    rgb, coverage = _composite(_image(splats, places, layout))
     return jnp.moveaxis(rgb, 0, -1), coverage
 
 
@@ -105,7 +116,7 @@ def splat_sum(
         (H, W, C).
     """
     splats = _Splats(pixel.T, inv_sigma, features.T)
-    return jnp.moveaxis(_image(splats, None, size, None), 0, -1)
+    return jnp.moveaxis(_image(splats, None, _Layout(size, (0,), None)), 1, -1)[0]
 
 
 def _project(model: SplatModel, poses: jax.Array, camera: Camera) -> tuple[_Splats, jax.Array]:
@@ -142,94 +153,176 @@ def _by_link(matrices: jax.Array, of_link: jax.Array, vectors: jax.Array) -> jax
 
 @jax.custom_vjp
 def _composite(total: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Colour (3, H, W) and coverage (H, W) from sums (5, H, W) of weighted rgb, weight, density."""
+    """Colour (3, H, W) and coverage (H, W) from sums (L, 5, H, W) of the layers.
+
+    The channels are weighted rgb, weight and density.
+    """
     return _composite_fwd(total)[0]
 
 
 def _composite_fwd(total):
-    coverage = 1.0 - jnp.exp(-total[4])
     # Weights may be so small that their square, which automatic derivatives take, underflows.
-    inverse = 1.0 / (total[3] + MIN_WEIGHT)
-    colour = total[:3] * inverse
-    return (colour * coverage, coverage), (colour, coverage, inverse)
+    inverse = 1.0 / (total[:, 3] + MIN_WEIGHT)
+    coverage = 1.0 - jnp.exp(-total[:, 4])
+    colour = total[:, :3] * inverse[:, None]
+    rgb = colour * coverage[:, None]
+    over, merges = (rgb[0], coverage[0], total[0, 3]), []
+    for layer in range(1, len(total)):
+        merges.append(over)
+        over = _merge(over, (rgb[layer], coverage[layer], total[layer, 3]))
+    return over[:2], (colour, rgb, coverage, inverse, merges, total[:, 3])
+
+
+def _merge(a, b):
+    """Two layers as one: each hides the other where it is in front and as far as it covers."""
+    (rgb_a, cover_a, weight_a), (rgb_b, cover_b, weight_b) = a, b
+    weight = weight_a + weight_b
+    b_in_front = weight_b / (weight + MIN_WEIGHT)
+    rgb = rgb_a * (1.0 - cover_b * b_in_front) + rgb_b * (1.0 - cover_a * (1.0 - b_in_front))
+    return rgb, cover_a + cover_b - cover_a * cover_b, weight
+
+
+def _merge_bar(a, b, bars):
+    (rgb_a, cover_a, weight_a), (rgb_b, cover_b, weight_b) = a, b
+    rgb_bar, cover_bar, weight_bar = bars
+    inverse = 1.0 / (weight_a + weight_b + MIN_WEIGHT)
+    b_in_front = weight_b * inverse
+    a_in_front = 1.0 - b_in_front
+    hidden_a = sum(rgb_bar[c] * rgb_a[c] for c in range(3))
+    hidden_b = sum(rgb_bar[c] * rgb_b[c] for c in range(3))
+    front_bar = (cover_a * hidden_b - cover_b * hidden_a) * inverse
+    a_bar = (
+        rgb_bar * (1.0 - cover_b * b_in_front),
+        cover_bar * (1.0 - cover_b) - a_in_front * hidden_b,
+        weight_bar - front_bar * b_in_front,
+    )
+    b_bar = (
+        rgb_bar * (1.0 - cover_a * a_in_front),
+        cover_bar * (1.0 - cover_a) - b_in_front * hidden_a,
+        weight_bar + front_bar * a_in_front,
+    )
+    return lax.optimization_barrier((a_bar, b_bar))
 
 
 def _composite_bwd(residuals, bars):
-    (colour, coverage, inverse), (rgb_bar, coverage_bar) = residuals, bars
-    along = sum(rgb_bar[c] * colour[c] for c in range(3))
-    weighted_bar = rgb_bar * (coverage * inverse)
-    weight_bar = -along * (coverage * inverse)
-    density_bar = (coverage_bar + along) * (1.0 - coverage)
-    return (jnp.concatenate([weighted_bar, weight_bar[None], density_bar[None]]),)
+    colour, rgb, coverage, inverse, merges, weight = residuals
+    bars, layer_bars = (*bars, jnp.zeros_like(bars[1])), []
+    for layer in range(len(merges), 0, -1):
+        own = (rgb[layer], coverage[layer], weight[layer])
+        bars, own_bars = _merge_bar(merges[layer - 1], own, bars)
+        layer_bars.insert(0, own_bars)
+    total_bars = []
+    for layer, (rgb_bar, cover_bar, weight_bar) in enumerate([bars, *layer_bars]):
+        along = sum(rgb_bar[c] * colour[layer, c] for c in range(3))
+        scale = coverage[layer] * inverse[layer]
+        density_bar = (cover_bar + along) * (1.0 - coverage[layer])
+        total_bars += [rgb_bar * scale, (weight_bar - along * scale)[None], density_bar[None]]
+    total_bars = lax.optimization_barrier(total_bars)
+    return (jnp.concatenate(total_bars).reshape(len(weight), 5, *weight.shape[1:]),)
 
 
 _composite.defvjp(_composite_fwd, _composite_bwd)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
-def _image(splats: _Splats, places: _Places | None, size, windows: Windows | None) -> jax.Array:
-    """Sum (C, H, W) over splats of footprint times feature."""
-    return _image_fwd(splats, places, size, windows)[0]
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _image(splats: _Splats, places: _Places | None, layout: _Layout) -> jax.Array:
+    """Sums (L, C, H, W) over each layer's splats of footprint times feature."""
+    return _image_fwd(splats, places, layout)[0]
 
 
-def _image_fwd(splats, places, size, windows):
-    whole = functools.partial(_sum_whole, size)
-    cut = whole if windows is None else functools.partial(_sum_windows, size, windows)
+def _image_fwd(splats, places, layout):
+    whole = functools.partial(_sum_whole, layout)
+    cut = whole if places is None else functools.partial(_sum_windows, layout)
     return _each_lane(cut, whole)(splats, places), (splats, places)
 
 
-def _image_bwd(size, windows, residuals, image_bar):
+def _image_bwd(layout, residuals, image_bar):
     splats, places = residuals
-    cut = _sum_whole_bar if windows is None else functools.partial(_sum_windows_bar, windows)
-    return _each_lane(cut, _sum_whole_bar)(splats, places, image_bar), None
+    whole = functools.partial(_sum_whole_bar, layout)
+    cut = whole if places is None else functools.partial(_sum_windows_bar, layout)
+    return _each_lane(cut, whole)(splats, places, image_bar), None
 
 
 _image.defvjp(_image_fwd, _image_bwd)
 
 
-def _sum_whole(size, splats, places=None):
+def _layers(layout: _Layout, splats: _Splats) -> list[_Splats]:
+    """The splats of each layer."""
+    ends = (*layout.starts[1:], splats.inv_sigma.shape[-1])
+    return [
+        jax.tree.map(lambda a: a[..., start:end], splats)  # noqa: B023 - used at once
+        for start, end in zip(layout.starts, ends, strict=True)
+    ]
+
+
+def _sum_whole(layout, splats, places=None):
+    return jnp.stack([_sum(layout.size, layer) for layer in _layers(layout, splats)])
+
+
+def _sum_whole_bar(layout, splats, places, image_bar):
+    layers = _layers(layout, splats)
+    bars = [_sum_bar(layer, bar) for layer, bar in zip(layers, image_bar, strict=True)]
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-1), *bars)
+
+
+def _sum(size, splats):
+    """Sum (C, H, W) of all splats over the whole image."""
     return _products(_clusters(splats, 1), jnp.zeros((2, 1), jnp.int32), size)[0]
 
 
-def _sum_whole_bar(splats, places, image_bar):
+def _sum_bar(splats, image_bar):
     corner = jnp.zeros((2, 1), jnp.int32)
-    return jax.tree.map(
-        lambda bar: bar[0], _products_bar(_clusters(splats, 1), corner, image_bar[None])
-    )
+    bars = _products_bar(_clusters(splats, 1), corner, image_bar[None])
+    return jax.tree.map(lambda bar: bar[0], bars)
 
 
-def _sum_windows(size, windows, splats, places):
-    clusters = _clusters(splats, len(places.fits))
+def _cluster_layers(layout: _Layout, num: int, cluster: int) -> jax.Array:
+    """Layers (K,) of the clusters."""
+    first = cluster * np.arange(num)
+    return jnp.asarray(np.searchsorted(layout.starts, first, side="right") - 1)
+
+
+def _sum_windows(layout, splats, places):
+    windows, num = layout.windows, len(places.fits)
+    clusters, layer = _clusters(splats, num), _cluster_layers(layout, num, windows.cluster)
     inside = jnp.where(places.fits[:, None, None], clusters.features, 0.0)
     window = (windows.px, windows.px)
     sums = _products(clusters._replace(features=inside), places.corner, window)
     order = jnp.argsort(places.fits)
 
+    def add_at(image, start, part):
+        old = lax.dynamic_slice(image, start, part.shape)
+        return lax.dynamic_update_slice(image, old + part, start)
+
     def add(k, image):
         left, top = places.corner[:, k]
-        old = lax.dynamic_slice(image, (0, top, left), sums.shape[1:])
-        return lax.dynamic_update_slice(image, old + sums[k], (0, top, left))
+        return add_at(image, (layer[k], 0, top, left), sums[k][None])
 
     def add_outside(i, image):
-        return image + _sum_whole(size, jax.tree.map(lambda a: a[order[i]], clusters))
+        k = order[i]
+        own = _sum(layout.size, jax.tree.map(lambda a: a[k], clusters))
+        return add_at(image, (layer[k], 0, 0, 0), own[None])
 
-    image = jnp.zeros((sums.shape[1], *size), sums.dtype)
-    image = lax.fori_loop(0, len(order), add, image)
+    image = jnp.zeros((len(layout.starts), sums.shape[1], *layout.size), sums.dtype)
+    image = lax.fori_loop(0, num, add, image)
     return lax.fori_loop(0, jnp.sum(~places.fits), add_outside, image)
 
 
-def _sum_windows_bar(windows, splats, places, image_bar):
-    clusters = _clusters(splats, len(places.fits))
-    window = (len(image_bar), windows.px, windows.px)
+def _sum_windows_bar(layout, splats, places, image_bar):
+    windows, num = layout.windows, len(places.fits)
+    clusters, layer = _clusters(splats, num), _cluster_layers(layout, num, windows.cluster)
+    window = (1, image_bar.shape[1], windows.px, windows.px)
     left, top = places.corner
-    sums_bar = jax.vmap(lambda x, y: lax.dynamic_slice(image_bar, (0, y, x), window))(left, top)
+    sums_bar = jax.vmap(lambda k, x, y: lax.dynamic_slice(image_bar, (k, 0, y, x), window)[0])(
+        layer, left, top
+    )
     bars = _products_bar(clusters, places.corner, sums_bar)
     order = jnp.argsort(places.fits)
 
     def replace(i, bars):
-        splats = jax.tree.map(lambda a: a[order[i]], clusters)
-        bar = _sum_whole_bar(splats, None, image_bar)
-        return jax.tree.map(lambda all, one: all.at[order[i]].set(one), bars, bar)
+        k = order[i]
+        bar = _sum_bar(jax.tree.map(lambda a: a[k], clusters), image_bar[layer[k]])
+        return jax.tree.map(lambda all, one: all.at[k].set(one), bars, bar)
 
     bars = lax.fori_loop(0, jnp.sum(~places.fits), replace, bars)
     return jax.tree.map(lambda a, bar: jnp.moveaxis(bar, 0, -2).reshape(a.shape), splats, bars)
@@ -331,20 +424,30 @@ def _in_turn(function: Callable, *args: Any) -> Any:
     return lax.scan(turn, lane(0), jnp.arange(num))[1]
 
 
-def _extents(splats: _Splats, depth, tau, cluster: int, size) -> tuple[jax.Array, jax.Array]:
+def _extents(
+    splats: _Splats, depth: jax.Array, tau: jax.Array, layout: _Layout, cluster: int
+) -> tuple[jax.Array, jax.Array]:
     """First and last pixels (2, K) x, y that clusters reach.
 
-    A splat may outshine one far behind it even where its own footprint is faint, so that its reach
-    grows with the depth behind it.
+    A splat may outshine one of its layer far behind it even where its own footprint is faint, so
+    that its reach grows with the depth behind it.
     """
     density = splats.features[-1]
     shows = density > FAINTEST
-    farthest = jnp.max(jnp.where(shows, depth, -jnp.inf))
+    behind = jnp.where(shows, depth, -jnp.inf)
+    ends = (*layout.starts[1:], len(depth))
+    farthest = jnp.concatenate(
+        [
+            jnp.broadcast_to(jnp.max(behind[start:end]), end - start)
+            for start, end in zip(layout.starts, ends, strict=True)
+        ]
+    )
     over = jnp.log(density / FAINTEST) + jnp.minimum((farthest - depth) / tau, -MIN_LOG_WEIGHT)
     reach = jnp.sqrt(2.0 * jnp.maximum(over, 0.0)) / splats.inv_sigma
+    height, width = layout.size
     low = jnp.where(shows, splats.pixel - reach, jnp.inf).reshape(2, -1, cluster)
     high = jnp.where(shows, splats.pixel + reach, -jnp.inf).reshape(2, -1, cluster)
-    end = jnp.array([[size[1]], [size[0]]])
+    end = jnp.array([[width], [height]])
     low = jnp.clip(jnp.floor(jnp.min(low, axis=-1)), 0, end)
     return low.astype(jnp.int32), jnp.clip(jnp.max(high, axis=-1), 0, end)
 
@@ -376,12 +479,16 @@ def choose_windows(
     order = np.concatenate([np.resize(group, cluster) for group in groups])
     spare = np.concatenate([np.arange(cluster) >= len(group) for group in groups])
     clustered = jax.tree.map(lambda a: a[order] if a.ndim else a, model)
-    clustered = dataclasses.replace(clustered, density=jnp.where(spare, 0.0, clustered.density))
-    size = (camera.height, camera.width)
-
+    # Layers begin with a link, and so with a cluster.
+    first = np.searchsorted(link[order], link[list(model.starts)])
+    clustered = dataclasses.replace(
+        clustered,
+        density=jnp.where(spare, 0.0, clustered.density),
+        starts=tuple(first.tolist()),
+    )
     needed = _needed(clustered, poses, camera, cluster)
     px = int(8 * np.ceil(np.quantile(needed, 0.95) / 8))
-    if px > 5 * min(size) // 8:
+    if px > 5 * min(camera.height, camera.width) // 8:
         return model, None
     return clustered, Windows(cluster=cluster, px=px)
 
@@ -390,8 +497,8 @@ def choose_windows(
 @functools.partial(jax.vmap, in_axes=(None, 0, None, None))
 def _needed(model: SplatModel, poses: jax.Array, camera: Camera, cluster: int) -> jax.Array:
     """Pixels (K,) that clusters reach over, in the longer direction."""
-    size = (camera.height, camera.width)
-    low, high = _extents(*_project(model, poses, camera), model.tau, cluster, size)
+    layout = _Layout((camera.height, camera.width), model.starts, None)
+    low, high = _extents(*_project(model, poses, camera), model.tau, layout, cluster)
     return jnp.max(high - low, axis=0)
 
 

@@ -5,6 +5,7 @@ along its z axis, x to the right and y down.
 """
 
 import jax
+import numpy as np
 
 from vrrt_jax.core.types import pytree, static
 
@@ -31,11 +32,24 @@ class SplatModel:
     shade: jax.Array  # (G, 3) colour factor = 1 + shade . direction to the camera, in link frame
     link: jax.Array  # (G,) i32
     tau: jax.Array  # () softness of occlusion [m]
+    starts: tuple[int, ...] = static(default=(0,))  # first splat of each layer of whole links
 
     @property
     def num_splats(self) -> int:
         """G."""
         return self.radius.shape[0]
+
+
+def layer_starts(link: np.ndarray) -> tuple[int, ...]:
+    """First splats of two layers, of the inner and the outer half of the links.
+
+    An arm before its own body needs them most.
+
+    Args:
+        link: (G,) of each splat, rising.
+    """
+    outer = int(np.searchsorted(link, (link[-1] + 1) // 2))
+    return (0, outer) if 0 < outer < len(link) else (0,)
 
 
 @pytree
