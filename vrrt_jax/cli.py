@@ -68,6 +68,11 @@ def _parser() -> argparse.ArgumentParser:
         speed = kinds.add_parser(what, help="how fast this machine is")
         speed.set_defaults(run=_speed)
         speed.add_argument("--json", help="write the figures here")
+    twins = kinds.add_parser("twins", help="how alike a robot looks after half a turn of its wrist")
+    twins.set_defaults(run=_twins)
+    twins.add_argument("--tasks-per-level", type=int, default=20, help="tasks at each distance")
+    twins.add_argument("--json", help="write the figures here")
+    twins.add_argument("--figure", help="draw a goal of each robot and its twin into this .png")
     for what, words in (
         ("visual", "the paper's tasks, among obstacles"),
         ("pose", "recover the goal alone, without obstacles"),
@@ -297,7 +302,18 @@ def _meshes(robot):
 def _speed(arguments: argparse.Namespace) -> int:
     import importlib
 
-    figures = importlib.import_module(f"vrrt_jax.bench.{arguments.what}").run()
+    return _figures(importlib.import_module(f"vrrt_jax.bench.{arguments.what}").run(), arguments)
+
+
+def _twins(arguments: argparse.Namespace) -> int:
+    from vrrt_jax.bench import twins
+
+    if arguments.figure:
+        twins.draw(arguments.figure)
+    return _figures(twins.run(arguments.tasks_per_level), arguments)
+
+
+def _figures(figures: dict[str, Any], arguments: argparse.Namespace) -> int:
     text = json.dumps(figures, indent=2)
     print(text)
     if arguments.json:
