@@ -81,7 +81,9 @@ def write_page(files: Sequence[Path], folder: Path) -> Path:
         for results in group:
             on = results.get("machine")  # older files do not tell
             where = f" on {on['cores']} cores of {on['processor']}" if on else ""
-            parts += [f"`{_command(results)}`{where}", "", to_text(results), ""]
+            seen = results.get("self_model")
+            seen = f"self-model {seen}" if seen else "an earlier self-model"
+            parts += [f"`{_command(results)}`{where}, {seen}", "", to_text(results), ""]
         name = f"{what}_{robot}.png"
         _figure(group, folder / name)
         parts += [f"![success, causes, times and path lengths]({name})", ""]
