@@ -11,7 +11,7 @@ import pytest
 
 import vrrt_jax
 from vrrt_jax import baselines
-from vrrt_jax.bench import methods, protocol, runner, tables, tasks, worlds
+from vrrt_jax.bench import methods, protocol, runner, tables, tasks, twins, worlds
 from vrrt_jax.cli import main
 from vrrt_jax.core.obstacles import load_obstacles
 from vrrt_jax.core.verify import contacts
@@ -75,6 +75,23 @@ def test_psnr_is_highest_at_the_goal(near_task):
     at_goal = tasks.image_psnr("panda", near_task.q_goal, images, scenery)
     at_start = tasks.image_psnr("panda", near_task.q_start, images, scenery)
     assert at_goal > 60 > at_start
+
+
+def test_twins_look_alike(near_task, tmp_path, monkeypatch, capsys):
+    q = twins.twin("panda", near_task).q_goal
+    assert abs(q[-1] - near_task.q_goal[-1]) == pytest.approx(np.pi, abs=1e-5)
+    np.testing.assert_array_equal(q[:-1], near_task.q_goal[:-1])
+    assert not twins._is_nearer("panda", near_task)  # the goal is half a radian from the start
+
+    monkeypatch.setattr(twins, "ROBOTS", ("ur5e",))
+    monkeypatch.setattr(twins, "LEVELS", (2.5,))
+    monkeypatch.setattr(twins, "LOOKED_AT", 1)
+    figure = tmp_path / "twins.png"
+    assert main(["bench", "twins", "--tasks-per-level", "9", "--figure", str(figure)]) == 0
+    (level,) = json.loads(capsys.readouterr().out)["ur5e"]
+    assert level["n"] == 9 and level["psnr_db"] > 45  # its gripper is the same half a turn on
+    assert level["twin_is_nearer"] == pytest.approx(2 / 9)
+    assert figure.stat().st_size > 10_000
 
 
 def _attempt(**changes):

@@ -202,7 +202,7 @@ def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
     )
     lengths.set(xlabel="distance from start to goal [rad]", ylabel="path length [rad]")
     by_level.legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.12))
-    causes.legend(fontsize="small", ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.12))
+    causes.legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.12))
     figure.suptitle(f"{group[0]['what']}: {group[0]['robot']}")
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -85,7 +85,8 @@ def draw(path: str | Path, level: float = 2.5, seed: int = 0) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(len(ROBOTS), 3, figsize=(8.2, 8.4), layout="constrained")
+    size = (8.2, 2.8 * len(ROBOTS))
+    figure, axes = plt.subplots(len(ROBOTS), 3, figsize=size, squeeze=False, layout="constrained")
     for robot, row in zip(ROBOTS, axes, strict=True):
         task = make_task(robot, level, 0, seed, obstacles=True)
         goal, other = (goal_images(robot, t, Scenery())[0] for t in (task, twin(robot, task)))
