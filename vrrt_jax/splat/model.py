@@ -104,9 +104,11 @@ def load_self_model(path: str | Path) -> SelfModel:
                     )
                     for name in ARRAYS
                 },
-                starts=tuple(numbers.pop("starts")),
+                starts=tuple(numbers["starts"]),
             ),
-            **numbers,
+            size_px=numbers["size_px"],
+            psnr_db=numbers["psnr_db"],
+            match_bar=numbers["match_bar"],
         )
         for i, numbers in enumerate(header["levels"])
     )

@@ -246,11 +246,11 @@ def _image_bwd(layout, residuals, image_bar):
 _image.defvjp(_image_fwd, _image_bwd)
 
 
-def _layers(layout: _Layout, splats: _Splats) -> list[_Splats]:
-    """The splats of each layer."""
-    ends = (*layout.starts[1:], splats.inv_sigma.shape[-1])
+def _layers(layout: _Layout, of_splats: Any) -> list[Any]:
+    """Arrays (..., G), or a tree of them, of each layer's splats."""
+    ends = (*layout.starts[1:], None)
     return [
-        jax.tree.map(lambda a: a[..., start:end], splats)  # noqa: B023 - used at once
+        jax.tree.map(lambda a: a[..., start:end], of_splats)  # noqa: B023 - used at once
         for start, end in zip(layout.starts, ends, strict=True)
     ]
 
@@ -434,14 +434,8 @@ def _extents(
     """
     density = splats.features[-1]
     shows = density > FAINTEST
-    behind = jnp.where(shows, depth, -jnp.inf)
-    ends = (*layout.starts[1:], len(depth))
-    farthest = jnp.concatenate(
-        [
-            jnp.broadcast_to(jnp.max(behind[start:end]), end - start)
-            for start, end in zip(layout.starts, ends, strict=True)
-        ]
-    )
+    layers = _layers(layout, jnp.where(shows, depth, -jnp.inf))
+    farthest = jnp.concatenate([jnp.full_like(layer, jnp.max(layer)) for layer in layers])
     over = jnp.log(density / FAINTEST) + jnp.minimum((farthest - depth) / tau, -MIN_LOG_WEIGHT)
     reach = jnp.sqrt(2.0 * jnp.maximum(over, 0.0)) / splats.inv_sigma
     height, width = layout.size
