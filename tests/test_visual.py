@@ -340,7 +340,6 @@ def test_another_attempt_while_nothing_matches(panda, self_model, camera, image,
     assert begun == [1, 3]
     assert all(r.status is vrrt_jax.Status.NO_MATCH for r in results)
     assert results[1].loss <= results[0].loss
-    assert results[1].timing["search_s"] > results[0].timing["search_s"]
 
 
 def test_a_guess_becomes_a_root(panda, self_model, camera, image, open_world):
