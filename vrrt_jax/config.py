@@ -33,13 +33,15 @@ class PlannerConfig:
     probe_steps: int = 60  # Adam steps that the kept ones take at that resolution
     probes_kept: int = 64  # best of them, which improve and become roots (re-compiles)
     probe_px: int = 32  # image height that they are rendered at (re-compiles)
-    hypotheses: int = 4  # matches that are polished on a larger image; 0 = none
-    polish_lanes: int = 8  # samples of each, along what the image leaves open
-    polish_px: int = 128  # height of that image (re-compiles)
-    polish_rounds: int = 3  # of spreading ever less widely, and descending
-    polish_steps: int = 4  # Levenberg-Marquardt, in each round
-    polish_reach: float = 1.5  # how far the samples spread at most [rad]
-    start_prior: float = 0.005  # goal losses that a radian from the start costs there
+    hypotheses: int = 4  # distinct best nodes that are polished; 0 = none
+    polish_samples: int = 256  # around them, in each round
+    polish_lanes: int = 32  # best of these, which descend
+    polish_kept: int = 8  # distinct ends that go on
+    polish_rounds: int = 3  # of spreading and descending; twice as many while nothing matches
+    polish_spread: float = 0.8  # of a joint in the first round, half of that in the next [rad]
+    polish_steps: int = 4  # Levenberg-Marquardt, in each round and at the end
+    polish_px: int = 128  # image height at the end (re-compiles)
+    start_prior: float = 0.005  # goal losses that a radian from the start costs then
     start_preference: float = 0.015  # share of the loss that a squared radian from it counts for
     inherit: bool = True  # a child goes on with its parent's Adam moments
     rewiring: bool = True  # RRT* (re-compiles)

@@ -17,7 +17,7 @@ from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import Rejection, Status
 from vrrt_jax.core.verify import verify_path
 from vrrt_jax.core.world import World, obstacle_list
-from vrrt_jax.polish import DISTINCT, GLANCES, LANES, Polishing, apart, glance, look_at, polish
+from vrrt_jax.polish import DISTINCT, GLANCES, LOOKS, Polishing, apart, glance, look_at, polish
 from vrrt_jax.robots.robot import Robot
 
 STATUS_OF = {
@@ -131,9 +131,14 @@ def _polished(
     found: SearchResult, world: World, polishing: Polishing, q: np.ndarray, key: jax.Array
 ) -> tuple[SearchResult, tuple[np.ndarray, np.ndarray]]:
     """What :func:`polish` returns; its time is added to the search's."""
+    coarse, fine = polishing.coarse, polishing.fine
     compile_s = sum(
-        timed(look, world, polishing.closer, np.resize(q, (lanes, q.shape[1])))[1]
-        for look, lanes in ((glance, GLANCES), (look_at, LANES))
+        timed(look, world, closer, np.resize(q, (lanes, q.shape[1])))[1]
+        for look, closer, lanes in (
+            (glance, coarse, GLANCES),
+            (look_at, coarse, LOOKS),
+            (look_at, fine, LOOKS),
+        )
     )
     started = time.perf_counter()
     result = polish(world, polishing, q, int(jax.random.bits(key, dtype=jnp.uint32)))

@@ -1,10 +1,11 @@
 """Tell apart what a small image cannot: matched configurations, looked at more closely.
 
-At the resolution of the search some directions are open: a wrist may turn by a radian and the image
-hardly changes. Near a match these are the weak eigenvectors of the Gauss-Newton matrix. Polishing
-spreads samples along them and lets all descend by Levenberg-Marquardt on a larger image with more
-splats. With few joints that takes forward renders alone. What no image tells, such as the turn of a
-bare flange, stays near the start: a weak prior sees to that.
+Many configurations look nearly like the goal: half a turn of a gripper, another elbow, a wrist that
+makes up for another. Each is a valley of the loss of its own, which gradients do not leave. So
+samples spread widely around the best nodes of a search, with some joints moved and others not, and
+all descend by Levenberg-Marquardt, for which with few joints forward renders suffice. The distinct
+ends start the next round. The last of them descend on a larger image with more splats, which tells
+what the small one does not. What no image tells stays near the start: a weak prior sees to that.
 """
 
 import dataclasses
@@ -22,20 +23,21 @@ from vrrt_jax.splat.loss import weighted_goal, weighted_image
 from vrrt_jax.splat.raster import map_lanes
 from vrrt_jax.visual import VisualPolicy
 
-LANES = 8  # configurations looked at in one call, and that descend
+LOOKS = 8  # configurations looked at in one call
 GLANCES = 32  # configurations whose cost alone is asked for, in one call
-PROBE = 0.01  # [rad] step of the finite differences
-OTHERS = 0.5  # standard deviations that samples spread along all but the weakest direction
+PROBE = 5e-4  # [rad] step of the finite differences; longer ones lose the weak directions
 RIDGE = 1e-7  # keeps joints that no pixel sees where they are
 LONGEST = 0.3  # [rad] of one step of a joint
+FEWEST_MOVED = 0.2  # share of its joints that a sample moves, at least, on average
+NARROWER = 0.5  # how far samples spread in a round, in units of the round before
 DISTINCT = 0.3  # [rad] distance at which configurations count as different
 
 
 @pytree
 class Closer:
-    """A closer look at the goal."""
+    """A look at the goal."""
 
-    policy: VisualPolicy  # with the larger goal; only its loss is used
+    policy: VisualPolicy  # only its loss is used
     q_start: jax.Array  # (D,)
     prior: jax.Array  # () loss that a radian away from the start costs
 
@@ -44,14 +46,16 @@ class Closer:
 class Polishing:
     """How configurations are polished."""
 
-    closer: Closer
-    goal_loss: float  # that counts as matched there
-    slack: float  # how much loss the first spread of samples may add, to second order
-    reach: float  # how far they spread at most [rad]
-    lanes: int  # samples of each configuration, itself and half a turn among them
+    coarse: Closer  # samples descend on this image
+    fine: Closer  # and the last of them on this one
+    coarse_goal_loss: float  # that counts as matched on the coarse image
+    goal_loss: float  # and on the fine one
+    samples: int  # of a round, in all
+    lanes: int  # best of them, which descend
     kept: int  # distinct configurations that leave a round
-    rounds: int  # of spreading and descending, each with a third of the slack of the one before
-    steps: int  # that a round descends
+    rounds: int  # of spreading and descending, each less widely; twice as many if nothing matches
+    spread: float  # standard deviation of a joint that moves, in the first round [rad]
+    steps: int  # that each descends, in every round and on the fine image
 
 
 class _Look(NamedTuple):
@@ -71,32 +75,32 @@ def polish(
     """Spread configurations (H, D) and descend.
 
     Returns:
-        Distinct configurations (at most kept, D), best first, and their image losses; infinite in
-        collision.
+        Distinct configurations (at most kept, D), best first, and their losses on the fine image;
+        infinite in collision.
     """
     rng = np.random.default_rng(seed)
-    kept = _look(world, polishing, q)
-    for k in range(polishing.rounds):
-        samples = _spread(kept, polishing, polishing.slack / 3.0**k, rng)
-        cost = _in_blocks(glance, world, polishing, samples, GLANCES)[0]
-        best = _look(world, polishing, samples[np.argsort(cost, kind="stable")[:LANES]])
-        best = _descend(world, polishing, best, polishing.steps)
-        kept = _rows(best, _distinct(world, best, polishing.kept))
-    kept = _rows(kept, np.argsort(np.where(kept.free, kept.cost, np.inf), kind="stable"))
+    coarse, fine, steps = polishing.coarse, polishing.fine, polishing.steps
+    kept = _look(world, coarse, q)
+    for k in range(2 * polishing.rounds):
+        matched = np.any(kept.free & (kept.cost <= polishing.coarse_goal_loss))
+        if k >= polishing.rounds and matched:
+            break
+        spread = polishing.spread * NARROWER ** min(k, polishing.rounds - 1)
+        samples = _spread(kept.q, polishing.samples, spread, rng)
+        cost = _in_blocks(glance, world, coarse, samples, GLANCES)[0]
+        best = _look(world, coarse, samples[np.argsort(cost, kind="stable")[: polishing.lanes]])
+        kept = _distinct(world, _descend(world, coarse, best, steps), polishing.kept)
+    kept = _distinct(world, _descend(world, fine, _look(world, fine, kept.q), steps), len(kept.q))
     return kept.q, np.where(kept.free, kept.loss, np.inf)
 
 
-def _rows(look: _Look, rows: np.ndarray) -> _Look:
-    return _Look(*(column[rows] for column in look))
-
-
-def _distinct(world: World, look: _Look, num: int) -> np.ndarray:
-    """Rows (at most num,) by rising cost, of those that are near each other only the first."""
-    kept: list[int] = []
-    for k in np.argsort(look.cost, kind="stable"):
-        if np.all(apart(world, look.q[kept], look.q[k]) > DISTINCT):
-            kept.append(k)
-    return np.array(kept[:num])
+def _distinct(world: World, look: _Look, num: int) -> _Look:
+    """At most num, the free ones first and by rising cost; of near ones only the first."""
+    rows: list[int] = []
+    for k in np.lexsort([look.cost, ~look.free]):
+        if np.all(apart(world, look.q[rows], look.q[k]) > DISTINCT):
+            rows.append(k)
+    return _Look(*(column[rows[:num]] for column in look))
 
 
 def apart(world: World, q: np.ndarray, q_other: np.ndarray) -> np.ndarray:
@@ -106,23 +110,18 @@ def apart(world: World, q: np.ndarray, q_other: np.ndarray) -> np.ndarray:
     return np.linalg.norm(step - 2 * np.pi * turns, axis=1)
 
 
-def _spread(
-    near: _Look, polishing: Polishing, slack: float, rng: np.random.Generator
-) -> np.ndarray:
-    """Samples (H * lanes, D) along the directions that the image tells little about."""
-    values, vectors = np.linalg.eigh(2.0 * near.matrix)  # rising
-    reach = np.minimum(np.sqrt(2.0 * slack / np.maximum(values, 1e-9)), polishing.reach)
-    num, joints = polishing.lanes - 2, near.q.shape[1]
-    along = OTHERS * rng.normal(size=(len(near.q), num, joints))
-    along[:, :, 0] = np.linspace(-1.0, 1.0, num)
-    samples = near.q[:, None] + np.einsum("hij,hlj->hli", vectors, reach[:, None] * along)
+def _spread(q: np.ndarray, num: int, spread: float, rng: np.random.Generator) -> np.ndarray:
+    """Samples (num, D) around configurations (H, D), which are the first of them."""
     # Grippers look alike after half a turn of the last joint.
-    turned = near.q.copy()
-    turned[:, -1] += np.where(near.q[:, -1] > 0, -np.pi, np.pi)
-    return np.concatenate([near.q[:, None], turned[:, None], samples], axis=1).reshape(-1, joints)
+    turned = q.copy()
+    turned[:, -1] += np.where(q[:, -1] > 0, -np.pi, np.pi)
+    shape = (-(-num // len(q)), *q.shape)
+    moved = rng.uniform(size=shape) < rng.uniform(FEWEST_MOVED, 1.0, (*shape[:2], 1))
+    around = q + spread * moved * rng.normal(size=shape)
+    return np.concatenate([q, turned, around.reshape(-1, q.shape[1])])[:num]
 
 
-def _descend(world: World, polishing: Polishing, now: _Look, steps: int) -> _Look:
+def _descend(world: World, closer: Closer, now: _Look, steps: int) -> _Look:
     """Levenberg-Marquardt: steps that lower the cost; those that do not raise the damping."""
     damping = np.full(len(now.q), 1e-3)
     for _ in range(steps):
@@ -130,7 +129,7 @@ def _descend(world: World, polishing: Polishing, now: _Look, steps: int) -> _Loo
         ridge = damping[:, None] * diagonal + RIDGE
         matrix = now.matrix + ridge[:, :, None] * np.eye(now.q.shape[1])
         change = -np.linalg.solve(matrix, now.slope[..., None])[..., 0]
-        tried = _look(world, polishing, now.q + np.clip(change, -LONGEST, LONGEST))
+        tried = _look(world, closer, now.q + np.clip(change, -LONGEST, LONGEST))
         better = tried.cost < now.cost
         damping *= np.where(better, 0.3, 4.0)
         now = _Look(
@@ -142,18 +141,18 @@ def _descend(world: World, polishing: Polishing, now: _Look, steps: int) -> _Loo
     return now
 
 
-def _look(world: World, polishing: Polishing, q: np.ndarray) -> _Look:
+def _look(world: World, closer: Closer, q: np.ndarray) -> _Look:
     """Look at configurations (n, D)."""
-    return _Look(*_in_blocks(look_at, world, polishing, q, LANES))
+    return _Look(*_in_blocks(look_at, world, closer, q, LOOKS))
 
 
 def _in_blocks(
-    function: Callable, world: World, polishing: Polishing, q: np.ndarray, size: int
+    function: Callable, world: World, closer: Closer, q: np.ndarray, size: int
 ) -> list[np.ndarray]:
     """Arrays (n, ...) about configurations (n, D), a few at a time: one program serves any n."""
     blocks = -(-len(q) // size)
     padded = np.resize(q, (blocks * size, q.shape[1])).astype(np.float32)
-    seen = [function(world, polishing.closer, block) for block in np.split(padded, blocks)]
+    seen = [function(world, closer, block) for block in np.split(padded, blocks)]
     return [np.concatenate(column)[: len(q)] for column in zip(*jax.device_get(seen), strict=True)]
 
 

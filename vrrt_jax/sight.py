@@ -20,8 +20,6 @@ from vrrt_jax.splat.raster import Windows, choose_windows
 from vrrt_jax.splat.types import Camera, SplatModel
 from vrrt_jax.visual import Probing, VisualPolicy
 
-POLISH_SLACK = 2.0  # goal losses that the spread of samples may add
-
 
 class Sight:
     """A robot's goal images, to be compared with at any resolution.
@@ -76,7 +74,11 @@ def visual_setup(sight: Sight, q_start: np.ndarray, config: PlannerConfig) -> Se
         policy=policy,
         goal_loss=goal_loss,
         probing=visual_probing(sight, policy, config),
-        polishing=visual_polishing(sight, policy, q_start, config) if config.hypotheses else None,
+        polishing=(
+            visual_polishing(sight, policy, goal_loss, q_start, config)
+            if config.hypotheses
+            else None
+        ),
     )
 
 
@@ -122,23 +124,29 @@ def visual_probing(sight: Sight, policy: VisualPolicy, config: PlannerConfig) ->
 
 
 def visual_polishing(
-    sight: Sight, policy: VisualPolicy, q_start: np.ndarray, config: PlannerConfig
+    sight: Sight,
+    policy: VisualPolicy,
+    coarse_goal_loss: float,
+    q_start: np.ndarray,
+    config: PlannerConfig,
 ) -> Polishing:
     """How matches are looked at after the search."""
     fields, goal_loss = sight.at(config.polish_px, config.match_scale)
-    closer = Closer(
-        policy=dataclasses.replace(policy, **fields),
-        q_start=jnp.asarray(q_start),
-        prior=jnp.float32(config.start_prior * goal_loss),
-    )
+
+    def closer(policy: VisualPolicy, goal_loss: float) -> Closer:
+        prior = jnp.float32(config.start_prior * goal_loss)
+        return Closer(policy=policy, q_start=jnp.asarray(q_start), prior=prior)
+
     return Polishing(
-        closer=closer,
+        coarse=closer(policy, coarse_goal_loss),
+        fine=closer(dataclasses.replace(policy, **fields), goal_loss),
+        coarse_goal_loss=coarse_goal_loss,
         goal_loss=goal_loss,
-        slack=POLISH_SLACK * goal_loss,
-        reach=config.polish_reach,
+        samples=config.polish_samples,
         lanes=config.polish_lanes,
-        kept=config.hypotheses,
+        kept=config.polish_kept,
         rounds=config.polish_rounds,
+        spread=config.polish_spread,
         steps=config.polish_steps,
     )
 
