@@ -19,7 +19,7 @@ from vrrt_jax.core import tree as trees
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.rewire import with_costs
 from vrrt_jax.core.tree import UNREACHED, lineage
-from vrrt_jax.polish import polish
+from vrrt_jax.polish import look_at, polish
 from vrrt_jax.sight import Sight, visual_policy, visual_setup
 from vrrt_jax.splat.loss import goal_loss, weighted_goal, weighted_image
 from vrrt_jax.visual import plant
@@ -270,6 +270,22 @@ def test_weighted_images_make_the_loss(panda, self_model, camera, image, rng):
     args = (panda.chain, policy.splats, policy.cameras, policy.goal, q, policy.windows)
     apart = jax.jit(weighted_image)(*args) - weighted_goal(policy.goal)
     assert float(jnp.sum(apart**2)) == pytest.approx(float(goal_loss(*args)), rel=1e-4)
+
+
+def test_looks_lead_where_the_gradient_does(panda, self_model, camera, image, open_world):
+    """Differences that are too long lose the weak directions, where steps are the longest."""
+    sight = Sight(panda, self_model, camera, image)
+    setup = visual_setup(sight, Q_START, planner.PlannerConfig(start_prior=0.0))
+    assert setup.polishing is not None
+    closer = setup.polishing.coarse
+    noise = np.random.default_rng(0).normal(size=(8, 7))
+    q = jnp.asarray(Q_GOAL + 0.03 * noise, jnp.float32)
+    gradient = jax.jit(jax.vmap(jax.grad(closer.policy.loss, argnums=1), (None, 0)))(open_world, q)
+    looks = jax.device_get(look_at(open_world, closer, q))
+    matrix, slope = looks[3], looks[4]
+    step = np.linalg.solve(matrix, slope[..., None])[..., 0]
+    exact = np.linalg.solve(matrix, 0.5 * np.asarray(gradient)[..., None])[..., 0]
+    np.testing.assert_allclose(step, exact, atol=0.1 * np.abs(exact).max())
 
 
 def test_polishing_turns_the_wrist_back(panda, self_model, camera, open_world):

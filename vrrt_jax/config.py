@@ -37,7 +37,7 @@ class PlannerConfig:
     polish_samples: int = 256  # around them, in each round
     polish_lanes: int = 32  # best of these, which descend
     polish_kept: int = 8  # distinct ends that go on
-    polish_rounds: int = 3  # of spreading and descending; twice as many while nothing matches
+    polish_rounds: int = 2  # of spreading and descending; twice as many while nothing matches
     polish_spread: float = 0.8  # of a joint in the first round, half of that in the next [rad]
     polish_steps: int = 4  # Levenberg-Marquardt, in each round and at the end
     polish_px: int = 128  # image height at the end (re-compiles)
@@ -47,8 +47,8 @@ class PlannerConfig:
     rewiring: bool = True  # RRT* (re-compiles)
     rewire_radius: float = 0.3  # [rad]
     max_iterations: int = 400
-    settle: int = 12  # once matched, iterations without improvement until the search ends
-    patience: int | None = 100  # iterations without improvement after which it gives up
+    settle: int = 6  # once matched, iterations without improvement until the search ends
+    patience: int | None = 25  # iterations without improvement after which it gives up
     min_improvement: float = 0.0  # an improvement is a loss this much smaller ...
     min_ratio: float = 0.97  # ... and below this share of the one before
     attempts: int = 2  # the later ones from other probes, while no path is found and verified
@@ -66,7 +66,14 @@ class PlannerConfig:
 
         It searches until the loss has not improved for 100 iterations, matched or not.
         """
-        paper = {"probes": 0, "hypotheses": 0, "anneal": 0.0, "settle": 100, "attempts": 1}
+        paper = {
+            "probes": 0,
+            "hypotheses": 0,
+            "anneal": 0.0,
+            "settle": 100,
+            "attempts": 1,
+            "patience": 100,
+        }
         paper |= {"min_improvement": 1e-4, "min_ratio": 1.0}
         return cls(**{**paper, **changes})
 

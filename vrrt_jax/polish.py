@@ -25,7 +25,7 @@ from vrrt_jax.visual import VisualPolicy
 
 LOOKS = 8  # configurations looked at in one call
 GLANCES = 32  # configurations whose cost alone is asked for, in one call
-PROBE = 5e-4  # [rad] step of the finite differences; longer ones lose the weak directions
+PROBE = 2e-4  # [rad] step of the finite differences; longer ones lose the weak directions
 RIDGE = 1e-7  # keeps joints that no pixel sees where they are
 LONGEST = 0.3  # [rad] of one step of a joint
 FEWEST_MOVED = 0.2  # share of its joints that a sample moves, at least, on average
