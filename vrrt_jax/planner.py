@@ -16,7 +16,7 @@ from vrrt_jax.core.rrt import RRT, RRTConnect, connection_path, tree_path
 from vrrt_jax.core.search import make_stop, search
 from vrrt_jax.core.types import Status
 from vrrt_jax.core.world import World
-from vrrt_jax.finish import finish, finish_visual, timed
+from vrrt_jax.finish import finish, finish_visual, timed, with_time_of
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.sight import Setup, Sight, visual_setup, visual_stop
 from vrrt_jax.splat.model import SelfModel
@@ -81,8 +81,7 @@ def plan(
         rest = dataclasses.replace(config, time_limit_s=left_s)
         other = _attempt(robot, world, setup, roots, key, rest, on_progress)
         best = min(result, other, key=lambda r: (not r.ok, r.loss))
-        spent = {name: result.timing[name] + other.timing[name] for name in result.timing}
-        result = dataclasses.replace(best, timing=spent)
+        result = with_time_of(best, result, other)
     return result
 
 
