@@ -145,6 +145,7 @@ def _polished(
         timed(look, world, closer, np.resize(q, (lanes, q.shape[1])))[1]
         for look, closer, lanes in (
             (glance, coarse, GLANCES),
+            (glance, fine, GLANCES),
             (look_at, coarse, LOOKS),
             (look_at, fine, LOOKS),
         )

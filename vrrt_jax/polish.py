@@ -29,6 +29,7 @@ PROBE = 2e-4  # [rad] step of the finite differences; longer ones lose the weak 
 RIDGE = 1e-7  # keeps joints that no pixel sees where they are
 LONGEST = 0.3  # [rad] of one step of a joint
 FEWEST_MOVED = 0.2  # share of its joints that a sample moves, at least, on average
+TURNS = 12  # in which the last joint goes all the way round
 NARROWER = 0.5  # how far samples spread in a round, in units of the round before
 DISTINCT = 0.3  # [rad] distance at which configurations count as different
 
@@ -90,7 +91,9 @@ def polish(
         cost = _in_blocks(glance, world, coarse, samples, GLANCES)[0]
         best = _look(world, coarse, samples[np.argsort(cost, kind="stable")[: polishing.lanes]])
         kept = _distinct(world, _descend(world, coarse, best, steps), polishing.kept)
-    kept = _distinct(world, _descend(world, fine, _look(world, fine, kept.q), steps), len(kept.q))
+    turned = _turned(world, fine, kept.q, polishing.kept)
+    best = _descend(world, fine, _look(world, fine, turned), steps)
+    kept = _distinct(world, best, polishing.kept)
     return kept.q, np.where(kept.free, kept.loss, np.inf)
 
 
@@ -119,6 +122,20 @@ def _spread(q: np.ndarray, num: int, spread: float, rng: np.random.Generator) ->
     moved = rng.uniform(size=shape) < rng.uniform(FEWEST_MOVED, 1.0, (*shape[:2], 1))
     around = q + spread * moved * rng.normal(size=shape)
     return np.concatenate([q, turned, around.reshape(-1, q.shape[1])])[:num]
+
+
+def _turned(world: World, closer: Closer, q: np.ndarray, num: int) -> np.ndarray:
+    """The best minima (at most num, D) over a whole turn of the last joint of each of (H, D).
+
+    That turn is what images tell least: a gripper spins about its axis and hardly changes.
+    """
+    joints = q.shape[1]
+    turn = 2 * np.pi / TURNS * np.arange(TURNS)
+    around = (q[:, None] + turn[:, None] * np.eye(joints)[-1]).reshape(-1, joints)
+    cost = _in_blocks(glance, world, closer, around, GLANCES)[0].reshape(-1, TURNS)
+    lowest = np.minimum(np.roll(cost, 1, axis=1), np.roll(cost, -1, axis=1)) >= cost
+    order = np.argsort(np.where(lowest, cost, np.inf), axis=None, kind="stable")
+    return around[order[: min(num, np.sum(lowest))]]
 
 
 def _descend(world: World, closer: Closer, now: _Look, steps: int) -> _Look:
