@@ -125,17 +125,18 @@ def _spread(q: np.ndarray, num: int, spread: float, rng: np.random.Generator) ->
 
 
 def _turned(world: World, closer: Closer, q: np.ndarray, num: int) -> np.ndarray:
-    """The best minima (at most num, D) over a whole turn of the last joint of each of (H, D).
+    """The best (at most num, D) of configurations (H, D) and their minima over the last joint.
 
-    That turn is what images tell least: a gripper spins about its axis and hardly changes.
+    Its turn is what images tell least: a gripper spins about its axis and hardly changes.
     """
     joints = q.shape[1]
     turn = 2 * np.pi / TURNS * np.arange(TURNS)
     around = (q[:, None] + turn[:, None] * np.eye(joints)[-1]).reshape(-1, joints)
     cost = _in_blocks(glance, world, closer, around, GLANCES)[0].reshape(-1, TURNS)
-    lowest = np.minimum(np.roll(cost, 1, axis=1), np.roll(cost, -1, axis=1)) >= cost
-    order = np.argsort(np.where(lowest, cost, np.inf), axis=None, kind="stable")
-    return around[order[: min(num, np.sum(lowest))]]
+    allowed = (cost < np.roll(cost, 1, axis=1)) & (cost <= np.roll(cost, -1, axis=1))
+    allowed[:, 0] = True
+    order = np.argsort(np.where(allowed, cost, np.inf), axis=None, kind="stable")
+    return around[order[: min(num, np.sum(allowed))]]
 
 
 def _descend(world: World, closer: Closer, now: _Look, steps: int) -> _Look:
