@@ -113,12 +113,13 @@ def _attempt(**changes):
         ({}, {}, "matched the wrong pose"),
         ({}, {"alike": True}, "wrong pose that looks the same"),
         ({"has_path": False}, {"right": True, "alike": True}, "right pose, no path"),
+        ({"has_path": False}, {"right": True, "known": False}, "right pose, no path known"),
         ({"out_of_time": True}, {"right": True}, "out of time"),
         ({}, {"right": True, "valid": False}, "invalid path"),
     ],
 )
 def test_causes(changes, judged, cause):
-    judged = {"right": False, "valid": True, "alike": False} | judged
+    judged = {"right": False, "valid": True, "alike": False, "known": True} | judged
     assert methods._cause(_attempt(**changes), **judged) == cause
     assert cause in methods.CAUSES
 

@@ -36,6 +36,7 @@ CAUSES = (
     "matched the wrong pose",
     "wrong pose that looks the same",
     "right pose, no path",
+    "right pose, no path known",
     "out of time",
     "invalid path",
 )
@@ -118,13 +119,15 @@ def solve(
     valid = not collisions or verify_path(robot, obstacle_list(world), attempt.path).ok
     success = right and valid and attempt.has_path
     psnr_db = image_psnr(robot_name, attempt.path[-1], images, scenery)
-    cause = ""
+    length = _length(world, attempt.path)
+    reference, cause = None, ""
+    if collisions and right and (valid or not attempt.has_path):
+        reference = _reference_length(robot, world, task, key)
     if not success:
         # The meshes look more alike in the two poses than the self-model is like the meshes.
         alike = psnr_db >= self_model.level_for(config.polish_px).psnr_db
-        cause = _cause(attempt, right=right, valid=valid, alike=alike)
-    length = _length(world, attempt.path)
-    reference = _reference_length(robot, world, task, key) if success and collisions else None
+        known = reference is not None or not collisions
+        cause = _cause(attempt, right=right, valid=valid, alike=alike, known=known)
     return {
         "level": task.level,
         "index": task.index,
@@ -136,7 +139,7 @@ def solve(
         "max_error_rad": round(float(error.max()), 5),
         "l2_error_rad": round(float(np.linalg.norm(error)), 5),
         "path_length": round(length, 4),
-        "path_over_reference": round(length / reference, 4) if reference else None,
+        "path_over_reference": round(length / reference, 4) if success and reference else None,
         "loss": float(f"{attempt.loss:.4g}"),
         "psnr_db": round(psnr_db, 2),
         "time_s": round(attempt.search_s, 3),
@@ -155,11 +158,13 @@ def _reference_length(robot: Robot, world: World, task: Task, key: jax.Array) ->
     return _length(world, found.path) if found.ok else None
 
 
-def _cause(attempt: Attempt, *, right: bool, valid: bool, alike: bool) -> str:
+def _cause(attempt: Attempt, *, right: bool, valid: bool, alike: bool, known: bool) -> str:
     if attempt.out_of_time:
         return "out of time"
-    if right:
-        return "invalid path" if attempt.has_path and not valid else "right pose, no path"
+    if right and attempt.has_path and not valid:
+        return "invalid path"
+    if right:  # RRT-Connect may know no path to the true goal either
+        return "right pose, no path" if known else "right pose, no path known"
     if alike:
         return "wrong pose that looks the same"
     return "matched the wrong pose" if attempt.matched else "no match found"

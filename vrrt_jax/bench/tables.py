@@ -20,7 +20,7 @@ PAPER_NOTE = (
     "The paper's numbers are its own: other worlds, tasks and self-models, 100 tasks a level, on "
     "an NVIDIA RTX 4090; 21.6 s a plan for the Panda."
 )
-CAUSE_COLOURS = ("#4878a8", "#d9903d", "#ecc68f", "#8a8a8a", "#7a5aa6", "#b5433f")
+CAUSE_COLOURS = ("#4878a8", "#d9903d", "#ecc68f", "#8a8a8a", "#c4c4c4", "#7a5aa6", "#b5433f")
 
 
 def to_text(results: dict[str, Any]) -> str:
