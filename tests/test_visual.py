@@ -224,7 +224,7 @@ def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
     )
     before = len(traces)  # one of the visual search, one of the connection to its match
     assert before <= 2
-    few = {"max_iterations": 4}
+    few = {"max_iterations": 4, "attempts": 1, "hypotheses": 0}
     run(world=moved, **few)
     run(image=picture(panda, self_model, camera, Q_GOAL + 0.1), **few)
     run(q_start=Q_START + 0.1, **few)
@@ -236,7 +236,7 @@ def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
 
 
 def test_batch_equals_single_plans(panda, self_model, camera, image, open_world):
-    config = dataclasses.replace(SMALL, max_iterations=10, settle=0, rewiring=False)
+    config = dataclasses.replace(SMALL, max_iterations=10, settle=0, rewiring=False, hypotheses=0)
     other = picture(panda, self_model, camera, Q_GOAL + 0.2)
     key = jax.random.key(5)
     starts = np.stack([Q_START, Q_START + 0.05])
