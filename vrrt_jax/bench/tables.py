@@ -201,8 +201,8 @@ def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
         xscale="log",
     )
     lengths.set(xlabel="distance from start to goal [rad]", ylabel="path length [rad]")
-    by_level.legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.12))
-    causes.legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.12))
+    by_level.legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.17))
+    causes.legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.17))
     figure.suptitle(f"{group[0]['what']}: {group[0]['robot']}")
     figure.savefig(path, dpi=110)
     plt.close(figure)
