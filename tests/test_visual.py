@@ -224,7 +224,7 @@ def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
     )
     before = len(traces)  # one of the visual search, one of the connection to its match
     assert before <= 2
-    few = {"max_iterations": 4, "attempts": 1, "hypotheses": 0}
+    few = {"max_iterations": 4, "attempts": 1, "polish_rounds": 1}
     run(world=moved, **few)
     run(image=picture(panda, self_model, camera, Q_GOAL + 0.1), **few)
     run(q_start=Q_START + 0.1, **few)
@@ -236,7 +236,7 @@ def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
 
 
 def test_batch_equals_single_plans(panda, self_model, camera, image, open_world):
-    config = dataclasses.replace(SMALL, max_iterations=10, settle=0, rewiring=False, hypotheses=0)
+    config = dataclasses.replace(SMALL, max_iterations=10, settle=0, rewiring=False)
     other = picture(panda, self_model, camera, Q_GOAL + 0.2)
     key = jax.random.key(5)
     starts = np.stack([Q_START, Q_START + 0.05])
@@ -356,6 +356,8 @@ def test_another_attempt_while_nothing_matches(panda, self_model, camera, image,
     assert begun == [1, 3]
     assert all(r.status is vrrt_jax.Status.NO_MATCH for r in results)
     assert results[1].loss <= results[0].loss
+    spent = finish.with_time_of(results[0], *results).timing["search_s"]
+    assert spent == results[0].timing["search_s"] + results[1].timing["search_s"]
 
 
 def test_a_guess_becomes_a_root(panda, self_model, camera, image, open_world):

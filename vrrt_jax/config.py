@@ -73,8 +73,9 @@ class PlannerConfig:
             "settle": 100,
             "attempts": 1,
             "patience": 100,
+            "min_improvement": 1e-4,
+            "min_ratio": 1.0,
         }
-        paper |= {"min_improvement": 1e-4, "min_ratio": 1.0}
         return cls(**{**paper, **changes})
 
 

@@ -140,15 +140,10 @@ def _polished(
     found: SearchResult, world: World, polishing: Polishing, q: np.ndarray, key: jax.Array
 ) -> tuple[SearchResult, tuple[np.ndarray, np.ndarray]]:
     """What :func:`polish` returns; its time is added to the search's."""
-    coarse, fine = polishing.coarse, polishing.fine
     compile_s = sum(
         timed(look, world, closer, np.resize(q, (lanes, q.shape[1])))[1]
-        for look, closer, lanes in (
-            (glance, coarse, GLANCES),
-            (glance, fine, GLANCES),
-            (look_at, coarse, LOOKS),
-            (look_at, fine, LOOKS),
-        )
+        for closer in (polishing.coarse, polishing.fine)
+        for look, lanes in ((glance, GLANCES), (look_at, LOOKS))
     )
     started = time.perf_counter()
     result = polish(world, polishing, q, int(jax.random.bits(key, dtype=jnp.uint32)))

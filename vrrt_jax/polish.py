@@ -81,17 +81,16 @@ def polish(
     """
     rng = np.random.default_rng(seed)
     coarse, fine, steps = polishing.coarse, polishing.fine, polishing.steps
-    kept = _look(world, coarse, q)
     for k in range(2 * polishing.rounds):
-        matched = np.any(kept.free & (kept.cost <= polishing.coarse_goal_loss))
-        if k >= polishing.rounds and matched:
-            break
         spread = polishing.spread * NARROWER ** min(k, polishing.rounds - 1)
-        samples = _spread(kept.q, polishing.samples, spread, rng)
+        samples = _spread(q, polishing.samples, spread, rng)
         cost = _in_blocks(glance, world, coarse, samples, GLANCES)[0]
         best = _look(world, coarse, samples[np.argsort(cost, kind="stable")[: polishing.lanes]])
         kept = _distinct(world, _descend(world, coarse, best, steps), polishing.kept)
-    turned = _turned(world, fine, kept.q, polishing.kept)
+        q, matched = kept.q, np.any(kept.free & (kept.cost <= polishing.coarse_goal_loss))
+        if matched and k + 1 >= polishing.rounds:
+            break
+    turned = _turned(world, fine, q, polishing.kept)
     best = _descend(world, fine, _look(world, fine, turned), steps)
     kept = _distinct(world, best, polishing.kept)
     return kept.q, np.where(kept.free, kept.loss, np.inf)
