@@ -70,7 +70,7 @@ def policy(panda, self_model, camera, image):
 def grown(world, policy, iterations, **changes):
     policy, probing = policy
     policy = dataclasses.replace(policy, **changes)
-    tree = plant(world, policy, probing, jnp.asarray(Q_START)[None], jax.random.key(1), 1024)
+    tree = plant(world, policy, probing, Q_START[None], jax.random.key(1), 1024)
     step = jax.jit(expand)
     for _ in range(iterations):
         tree = step(world, policy, tree, jax.random.key(0))
@@ -158,14 +158,13 @@ def test_costs_stay_right_under_rewiring(policy, open_world):
 def test_probes_are_free_near_and_look_alike_and_evolve(
     panda, self_model, camera, image, wall_world, free
 ):
-    planted = jax.jit(plant, static_argnums=5)
-    q_roots = jnp.asarray(Q_START)[None]
+    q_roots = Q_START[None]
 
     def probes(rounds):
         config = dataclasses.replace(SMALL, probe_steps=0, probe_rounds=rounds)
         setup = visual_setup(Sight(panda, self_model, camera, image), Q_START, config)
         probing = setup.probing
-        tree = planted(wall_world, setup.policy, probing, q_roots, jax.random.key(0), 512)
+        tree = plant(wall_world, setup.policy, probing, q_roots, jax.random.key(0), 512)
         assert np.all(np.asarray(tree.cost[1:8]) == UNREACHED) and float(tree.cost[0]) == 0
         roots = np.asarray(tree.q[1 : int(tree.size)])
         assert len(roots) == 7

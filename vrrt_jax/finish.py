@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -17,7 +17,7 @@ from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import Rejection, Status
 from vrrt_jax.core.verify import verify_path
 from vrrt_jax.core.world import World, obstacle_list
-from vrrt_jax.polish import DISTINCT, GLANCES, LOOKS, Polishing, apart, glance, look_at, polish
+from vrrt_jax.polish import DISTINCT, Polishing, apart, glance, look_at, polish
 from vrrt_jax.robots.robot import Robot
 
 STATUS_OF = {
@@ -140,15 +140,10 @@ def _polished(
     found: SearchResult, world: World, polishing: Polishing, q: np.ndarray, key: jax.Array
 ) -> tuple[SearchResult, tuple[np.ndarray, np.ndarray]]:
     """What :func:`polish` returns; its time is added to the search's."""
-    compile_s = sum(
-        timed(look, world, closer, np.resize(q, (lanes, q.shape[1])))[1]
-        for closer in (polishing.coarse, polishing.fine)
-        for look, lanes in ((glance, GLANCES), (look_at, LOOKS))
-    )
-    started = time.perf_counter()
-    result = polish(world, polishing, q, int(jax.random.bits(key, dtype=jnp.uint32)))
-    search_s = found.search_s + time.perf_counter() - started
-    found = dataclasses.replace(found, compile_s=found.compile_s + compile_s, search_s=search_s)
+    seed = int(jax.random.bits(key, dtype=jnp.uint32))
+    result, compile_s, polish_s = timed(lambda: polish(world, polishing, q, seed), glance, look_at)
+    compile_s, search_s = found.compile_s + compile_s, found.search_s + polish_s
+    found = dataclasses.replace(found, compile_s=compile_s, search_s=search_s)
     return found, result
 
 
@@ -158,19 +153,22 @@ def with_time_of(result: PlanResult, *results: PlanResult) -> PlanResult:
     return dataclasses.replace(result, timing=timing)
 
 
-def timed(function: Any, *args: Any) -> tuple[Any, float, float]:
-    """The result of a jitted function, and the seconds of its compilation, if any, and its run."""
+def timed(run: Callable[[], Any], *programs: Any) -> tuple[Any, float, float]:
+    """The result of a run, and the seconds that compiling these jitted functions took, and it."""
 
-    def run() -> tuple[Any, float]:
+    def clocked() -> tuple[Any, float]:
         started = time.perf_counter()
-        result = jax.block_until_ready(function(*args))
+        result = jax.block_until_ready(run())
         return result, time.perf_counter() - started
 
-    programs = function._cache_size()
-    result, first_s = run()
-    if function._cache_size() == programs:
+    def compiled() -> int:
+        return sum(program._cache_size() for program in programs)
+
+    before = compiled()
+    result, first_s = clocked()
+    if compiled() == before:
         return result, 0.0, first_s
-    result, run_s = run()
+    result, run_s = clocked()
     return result, first_s - run_s, run_s
 
 

@@ -1,7 +1,6 @@
 """Planning, from the outside: what users call, with every input checked on the host."""
 
 import dataclasses
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,23 +10,21 @@ import numpy as np
 
 from vrrt_jax import checks
 from vrrt_jax.config import PlannerConfig, PlanResult
-from vrrt_jax.core import tree as trees
 from vrrt_jax.core.rrt import RRT, RRTConnect, connection_path, tree_path
 from vrrt_jax.core.search import make_stop, search
-from vrrt_jax.core.types import Status
+from vrrt_jax.core.tree import create
+from vrrt_jax.core.types import Status, Tree
 from vrrt_jax.core.world import World
 from vrrt_jax.finish import finish, finish_visual, timed, with_time_of
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.sight import Setup, Sight, visual_setup, visual_stop
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera
-from vrrt_jax.visual import plant
+from vrrt_jax.visual import best_probes, forest, plant
 
 PLANTING = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
 AGAIN = (Status.NO_MATCH, Status.NO_PATH, Status.NOT_VERIFIED)  # worth another attempt
 RRT_STAR_RADIUS = 1.9  # [rad] nodes of a sparse tree in seven dimensions lie that far apart
-
-_plant = jax.jit(plant, static_argnums=5)
 
 
 def plan(
@@ -95,8 +92,7 @@ def _attempt(
     on_progress: Callable[..., Any] | None,
 ) -> PlanResult:
     """Probe around the start (the first of the roots), search and finish, once."""
-    seeds = (setup.policy, setup.probing, jnp.asarray(roots), jax.random.fold_in(key, PLANTING))
-    tree, compile_s, plant_s = timed(_plant, world, *seeds, config.capacity)
+    tree, compile_s, plant_s = _planted(world, setup, roots, key, config)
     found = search(
         world,
         setup.policy,
@@ -111,6 +107,15 @@ def _attempt(
     )
     ends = (setup.goal_loss, setup.polishing, roots[0])
     return finish_visual(robot, world, found, *ends, key, config)
+
+
+def _planted(
+    world: World, setup: Setup, roots: np.ndarray, key: jax.Array, config: PlannerConfig
+) -> tuple[Tree, float, float]:
+    """The forest before the search, and the seconds for its compilation and for itself."""
+    key = jax.random.fold_in(key, PLANTING)
+    seeds = (setup.policy, setup.probing, roots, key, config.capacity)
+    return timed(lambda: plant(world, *seeds), best_probes, forest)
 
 
 def plan_batch(
@@ -160,26 +165,19 @@ def plan_batch(
             setups.append(visual_setup(sight, starts[-1], config))
         except ValueError as error:
             raise ValueError(f"problem {i}: {error}") from None
-    policies, probings = (_stack([getattr(s, n) for s in setups]) for n in ("policy", "probing"))
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(starts)))
-    started = time.perf_counter()
-    plants = jax.vmap(_plant, (None, 0, 0, 0, 0, None))
-    seeds = jax.vmap(jax.random.fold_in, (0, None))(keys, PLANTING)
-    tree = jax.block_until_ready(
-        plants(
-            world,
-            policies,
-            probings,
-            jnp.asarray(np.stack(starts))[:, None],
-            seeds,
-            config.capacity,
-        )
+    trees, compile_s, plant_s = zip(
+        *(
+            _planted(world, setup, q_start[None], own_key, config)
+            for setup, q_start, own_key in zip(setups, starts, keys, strict=True)
+        ),
+        strict=True,
     )
-    compile_s = time.perf_counter() - started
+    policies = _stack([setup.policy for setup in setups])
     found = search(
         world,
         policies,
-        tree,
+        _stack(trees),
         key=keys,
         stop=_stack([visual_stop(config, setup.goal_loss) for setup in setups]),
         time_limit_s=config.time_limit_s,
@@ -189,7 +187,12 @@ def plan_batch(
     results = []
     for i, (q_start, setup) in enumerate(zip(starts, setups, strict=True)):
         own_tree = jax.tree.map(lambda leaf: leaf[i], found.tree)  # noqa: B023 - used at once
-        own = dataclasses.replace(found, tree=own_tree, compile_s=found.compile_s + compile_s)
+        own = dataclasses.replace(
+            found,
+            tree=own_tree,
+            compile_s=found.compile_s + sum(compile_s),
+            search_s=found.search_s + sum(plant_s),
+        )
         ends = (setup.goal_loss, setup.polishing, q_start)
         results.append(finish_visual(robot, world, own, *ends, keys[i], config))
     return results
@@ -241,7 +244,7 @@ def plan_to_configuration(
             lanes=config.lanes,
         )
         score, payload = policy.root(world, start)
-        tree = trees.create(start[None], score[None], payload, config.capacity)
+        tree = create(start[None], score[None], payload, config.capacity)
         stop_score = -1.0 if policy.star else 1e-4
     else:
         raise ValueError(f"unknown planner '{planner}'; have: rrt, rrt-star, rrt-connect")

@@ -17,13 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.edges import difference, into_limits
+from vrrt_jax.core.parallel import on_cores
 from vrrt_jax.core.types import pytree
 from vrrt_jax.core.world import World, is_free
 from vrrt_jax.splat.loss import weighted_goal, weighted_image
 from vrrt_jax.splat.raster import map_lanes
 from vrrt_jax.visual import VisualPolicy
 
-LOOKS = 8  # configurations looked at in one call
+LOOKS = 4  # configurations looked at in one call: with their differences, a batch of renders
 GLANCES = 32  # configurations whose cost alone is asked for, in one call
 PROBE = 2e-4  # [rad] step of the finite differences; longer ones lose the weak directions
 RIDGE = 1e-7  # keeps joints that no pixel sees where they are
@@ -169,8 +170,8 @@ def _in_blocks(
     """Arrays (n, ...) about configurations (n, D), a few at a time: one program serves any n."""
     blocks = -(-len(q) // size)
     padded = np.resize(q, (blocks * size, q.shape[1])).astype(np.float32)
-    seen = [function(world, closer, block) for block in np.split(padded, blocks)]
-    return [np.concatenate(column)[: len(q)] for column in zip(*jax.device_get(seen), strict=True)]
+    seen = on_cores(lambda block: function(world, closer, block), np.split(padded, blocks))
+    return [np.concatenate(column)[: len(q)] for column in zip(*seen, strict=True)]
 
 
 @jax.jit

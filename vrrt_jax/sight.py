@@ -16,7 +16,7 @@ from vrrt_jax.polish import Closer, Polishing
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.splat.goal import prepare_goal
 from vrrt_jax.splat.model import SelfModel
-from vrrt_jax.splat.raster import Windows, choose_windows
+from vrrt_jax.splat.raster import LANES, Windows, choose_windows
 from vrrt_jax.splat.types import Camera, SplatModel
 from vrrt_jax.visual import Probing, VisualPolicy
 
@@ -113,13 +113,16 @@ def visual_probing(sight: Sight, policy: VisualPolicy, config: PlannerConfig) ->
     """Where to look before the search."""
     fields, _ = sight.at(config.probe_px, config.match_scale)
     coarse = dataclasses.replace(policy, **fields, alpha=jnp.float32(config.probe_alpha))
+    kept = min(config.probes, config.probes_kept)
+    parts = -(-kept // LANES)
     return Probing(
         policy=coarse,
         radius=jnp.float32(config.probe_radius),
         rounds=jnp.int32(config.probe_rounds),
         steps=jnp.int32(config.probe_steps),
-        num=config.probes,
-        kept=min(config.probes, config.probes_kept),
+        parts=parts,
+        num=-(-config.probes // max(parts, 1)),
+        kept=-(-kept // max(parts, 1)),
     )
 
 

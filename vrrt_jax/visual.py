@@ -5,13 +5,16 @@ gradient, and the child inherits the moments; exploring lanes take a random step
 """
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import difference, into_limits
+from vrrt_jax.core.parallel import on_cores
 from vrrt_jax.core.rewire import rewire
 from vrrt_jax.core.rrt import sample_configurations
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
@@ -178,21 +181,25 @@ class VisualPolicy:
 
 @pytree
 class Probing:
-    """Where to look before the search: forward-only renders around the start, at low resolution."""
+    """Where to look before the search: forward-only renders around the start, at low resolution.
+
+    It is done in parts of few enough lanes, that differ in their keys and may run side by side.
+    """
 
     policy: VisualPolicy  # with the coarse goal; only its loss is used
     radius: jax.Array  # () largest distance from the start [rad]
     rounds: jax.Array  # () i32 times that each kept one looks for something better around it
     steps: jax.Array  # () i32 Adam steps that each kept one takes
-    num: int = static()  # configurations rendered; none gives the plain tree of the paper
-    kept: int = static()  # best of them that descend; all but the last become roots
+    parts: int = static()  # none gives the plain tree of the paper
+    num: int = static()  # configurations that a part renders
+    kept: int = static()  # best of them that descend
 
 
 def plant(
     world: World,
     policy: VisualPolicy,
     probing: Probing,
-    q_roots: jax.Array,
+    q_roots: np.ndarray,
     key: jax.Array,
     capacity: int,
 ) -> Tree[VisualNode]:
@@ -209,10 +216,16 @@ def plant(
         key: random key.
         capacity: slots of the tree.
     """
-    q = q_roots
-    if probing.num:
-        # As many in all as descended, so that lanes come out even and compile once.
-        q = jnp.concatenate([q, _best_probes(world, probing, q_roots[0], key)[: -len(q_roots)]])
+    keys = jax.random.split(key, probing.parts)
+    probes = on_cores(lambda key: best_probes(world, probing, q_roots[0], key), keys)
+    # As many in all as descended, so that lanes come out even and compile once.
+    num = max(probing.parts * probing.kept, len(q_roots))
+    return forest(world, policy, np.concatenate([q_roots, *probes])[:num], capacity)
+
+
+@partial(jax.jit, static_argnums=3)
+def forest(world: World, policy: VisualPolicy, q: jax.Array, capacity: int) -> Tree[VisualNode]:
+    """Roots ``q`` (R, D), the start first; those in collision are never expanded."""
     score, payload = policy.roots(world, q)
     blocked = ~jax.vmap(is_free, (None, 0))(world, q)
     score = jnp.where(blocked, jnp.finfo(score.dtype).max, score)
@@ -221,7 +234,8 @@ def plant(
     return trees.create(q, score, payload, capacity, cost)
 
 
-def _best_probes(world: World, probing: Probing, q_start: jax.Array, key: jax.Array) -> jax.Array:
+@jax.jit
+def best_probes(world: World, probing: Probing, q_start: jax.Array, key: jax.Array) -> jax.Array:
     """Configurations (kept, D) around the start that are free and render most like the goal."""
     key_direction, key_distance, key_children = jax.random.split(key, 3)
     direction = jax.random.normal(key_direction, (probing.num, len(q_start)))

@@ -34,10 +34,8 @@ def iteration_split(problem: Problem, repeats: int = 15) -> dict:
     setup = visual_setup(sight, problem.q_start, config)
     policy = setup.policy
     world, key = problem.world, jax.random.key(0)
-    q_start = jnp.asarray(problem.q_start)[None]
-    tree = jax.jit(plant, static_argnums=5)(
-        world, policy, setup.probing, q_start, key, config.capacity
-    )
+    q_start = problem.q_start[None]
+    tree = plant(world, policy, setup.probing, q_start, key, config.capacity)
     found = search(
         world, policy, tree, key=key, stop=make_stop(-1.0, max_iterations=40), time_limit_s=60.0
     )

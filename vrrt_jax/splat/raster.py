@@ -27,6 +27,7 @@ from jax.custom_batching import custom_vmap
 from vrrt_jax.core.types import pytree, static
 from vrrt_jax.splat.types import Camera, SplatModel
 
+LANES = 32  # that are rendered at once
 NEAR = 0.05  # [m] splats nearer than this to the camera plane are not drawn
 PIXEL_BLUR = 0.1  # [px] a pixel's own footprint, added to every splat's; more costs up to 3 dB
 # The faintest footprint that counts in a float32 coverage, 6e-8, times exp(-66) is still a normal
@@ -96,9 +97,9 @@ def render(
 def map_lanes(f: Callable, *args: Any) -> Any:
     """Map ``f``, which renders, over the leading axis of all arguments' leaves.
 
-    Like ``vmap``, but with the memory of 32 lanes however many there are.
+    Like ``vmap``, but with the memory of :data:`LANES` lanes however many there are.
     """
-    return lax.map(lambda lane: f(*lane), args, batch_size=32)
+    return lax.map(lambda lane: f(*lane), args, batch_size=LANES)
 
 
 def splat_sum(
