@@ -16,7 +16,7 @@ from vrrt_jax.core.search import SearchResult, Stopped, make_stop, search
 from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import Rejection, Status
 from vrrt_jax.core.verify import verify_path
-from vrrt_jax.core.world import World, obstacle_list
+from vrrt_jax.core.world import World, obstacle_list, with_margin
 from vrrt_jax.polish import DISTINCT, Polishing, apart, glance, look_at, polish
 from vrrt_jax.robots.robot import Robot
 
@@ -29,6 +29,7 @@ STATUS_OF = {
 }
 TRIED = 3  # matched configurations that are tried before there is no path
 REFUSED = 3  # paths that the exact check may refuse before it has the last word
+WARY = 0.01  # [m] by which each of them keeps farther away than the one before
 SAME_LOSS = 1.05  # losses within this factor are the same match
 ALIKE = 1.1  # and within this factor the image does not tell which it is
 
@@ -89,8 +90,9 @@ def finish_visual(
             break
         key = jax.random.fold_in(key, again)
         idle = dataclasses.replace(found, compile_s=0.0, search_s=0.0)
-        other, path = _connected(world, idle, q_start, target, key, config)
-        other = finish(robot, world, other, path, target, loss, goal_loss, key, config, q_start)
+        wary = with_margin(world, again * WARY)
+        other, path = _connected(wary, idle, q_start, target, key, config)
+        other = finish(robot, wary, other, path, target, loss, goal_loss, key, config, q_start)
         result = with_time_of(other if other.ok else result, result, other)
     return dataclasses.replace(result, alternatives=q[alike], search_goal_loss=search_goal_loss)
 

@@ -158,6 +158,12 @@ def with_obstacles(world: World, obstacles: Sequence[Obstacle]) -> World:
     )
 
 
+def with_margin(world: World, margin: float) -> World:
+    """The same world, where the robot keeps ``margin`` [m] farther from obstacles and itself."""
+    reach = jnp.where(world.reach > 0, world.reach + margin, 0.0)
+    return dataclasses.replace(world, margin=world.margin + margin, reach=reach)
+
+
 def obstacle_list(world: World) -> list[Obstacle]:
     """The obstacles in the world's slots, as the host sees them."""
     slots = jax.tree.map(np.asarray, world.obstacles)
