@@ -24,6 +24,7 @@ from vrrt_jax.visual import best_probes, forest, plant
 
 PLANTING = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
 AGAIN = (Status.NO_MATCH, Status.NO_PATH, Status.NOT_VERIFIED)  # worth another attempt
+PERSISTENCE = 4  # later attempts take so many times the iterations to find a way to a match
 RRT_STAR_RADIUS = 1.9  # [rad] nodes of a sparse tree in seven dimensions lie that far apart
 
 
@@ -75,7 +76,8 @@ def plan(
         if result.status not in AGAIN or left_s <= 0:
             break
         key = jax.random.fold_in(key, PLANTING - again)
-        rest = dataclasses.replace(config, time_limit_s=left_s)
+        longer = PERSISTENCE * config.connect_iterations
+        rest = dataclasses.replace(config, time_limit_s=left_s, connect_iterations=longer)
         other = _attempt(robot, world, setup, roots, key, rest, on_progress)
         best = min(result, other, key=lambda r: (not r.ok, r.loss))
         result = with_time_of(best, result, other)
