@@ -121,9 +121,12 @@ def _is_paper(results: dict[str, Any]) -> bool:
 
 def _command(results: dict[str, Any]) -> str:
     words = ["vrrt bench", results["what"], "--robot", results["robot"]]
-    if results["what"] != "ablation":
+    if results["what"] == "ablation":
+        fields = {variant["name"].partition("=")[0] for variant in results["variants"]}
+        words += ["--only", *fields] if len(fields) == 1 else []
+    else:
         words += ["--method", results["variants"][0]["method"]]
-        words += ["--config", "paper" if _is_paper(results) else "default"]
+    words += ["--config", "paper" if _is_paper(results) else "default"]
     scenery = results["scenery"]
     words += ["--views 2"] if scenery["views"] == 2 else []
     words += ["--occluded"] if scenery["occluded"] else []
@@ -165,9 +168,14 @@ def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from cycler import cycler
+    from matplotlib.ticker import LogFormatter
 
     figure, axes = plt.subplots(2, 2, figsize=(12, 8), layout="constrained")
     (by_level, causes), (times, lengths) = axes
+    lines = cycler(linestyle=["-", "--", ":"]) * plt.rcParams["axes.prop_cycle"]
+    for axis in (by_level, times, lengths):
+        axis.set_prop_cycle(lines)
     labels, stacks = [], []
     for results in group:
         for name, summary in _variants(results).items():
@@ -178,9 +186,9 @@ def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
             total = sum(v["n"] for v in levels)
             name = f"{name} (n = {total})"
             distance = [level["distance_rad"] for level in levels]
-            by_level.plot(distance, [100 * v["success"] for v in levels], "o-", label=name)
+            by_level.plot(distance, [100 * v["success"] for v in levels], marker="o", label=name)
             lengths.plot(
-                distance, [v["path_length"] or float("nan") for v in levels], "o-", label=name
+                distance, [v["path_length"] or float("nan") for v in levels], marker="o", label=name
             )
             labels.append(name)
             counts = [sum(v["causes"].get(c, 0) for v in levels) for c in CAUSES]
@@ -200,6 +208,8 @@ def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
         ylabel="tasks done by then [%]",
         xscale="log",
     )
+    times.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
+    times.xaxis.set_major_formatter(LogFormatter())
     lengths.set(xlabel="distance from start to goal [rad]", ylabel="path length [rad]")
     by_level.legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.17))
     causes.legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.17))
