@@ -7,6 +7,7 @@ import pytest
 import vrrt_jax
 from vrrt_jax.core.mjx_backend import mjx_is_free, mjx_world
 from vrrt_jax.core.obstacles import load_obstacles, signed_distances
+from vrrt_jax.core.world import with_margin
 
 DISTANCE_TOLERANCE = 2e-5  # [m]; worst seen 4e-6, near a plane drawn as a 100 m box
 
@@ -101,6 +102,15 @@ def test_obstacles_move_without_retracing(panda, wall_world, rng):
     values = [float(clearance(w, q)) for w in (moved, other, empty)]
     assert len(traces) == 1
     assert values[0] < float(first) and values[2] > 100
+
+
+def test_more_margin_only_forbids_more_of_obstacles_and_itself(panda, wall_world, free, rng):
+    q = rng.uniform(panda.lower, panda.upper, (2000, 7)).astype(np.float32)
+    for world in (wall_world, vrrt_jax.build_world(panda)):  # the empty one: itself alone
+        now, wary = free(world, q), free(with_margin(world, 0.03), q)
+        assert not np.any(wary & ~now)
+        assert 0 < np.sum(wary) < np.sum(now)
+        np.testing.assert_array_equal(free(with_margin(world, 0.0), q), now)
 
 
 def test_obstacle_list_gives_back_what_went_in(panda, rng):
