@@ -10,9 +10,9 @@ import numpy as np
 
 from vrrt_jax import checks
 from vrrt_jax.config import PlannerConfig, PlanResult
+from vrrt_jax.core import tree as trees
 from vrrt_jax.core.rrt import RRT, RRTConnect, connection_path, tree_path
 from vrrt_jax.core.search import make_stop, search
-from vrrt_jax.core.tree import create
 from vrrt_jax.core.types import Status, Tree
 from vrrt_jax.core.world import World
 from vrrt_jax.finish import finish, finish_visual, timed, with_time_of
@@ -168,7 +168,7 @@ def plan_batch(
         except ValueError as error:
             raise ValueError(f"problem {i}: {error}") from None
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(starts)))
-    trees, compile_s, plant_s = zip(
+    forests, compile_s, plant_s = zip(
         *(
             _planted(world, setup, q_start[None], own_key, config)
             for setup, q_start, own_key in zip(setups, starts, keys, strict=True)
@@ -179,7 +179,7 @@ def plan_batch(
     found = search(
         world,
         policies,
-        _stack(trees),
+        _stack(forests),
         key=keys,
         stop=_stack([visual_stop(config, setup.goal_loss) for setup in setups]),
         time_limit_s=config.time_limit_s,
@@ -246,7 +246,7 @@ def plan_to_configuration(
             lanes=config.lanes,
         )
         score, payload = policy.root(world, start)
-        tree = create(start[None], score[None], payload, config.capacity)
+        tree = trees.create(start[None], score[None], payload, config.capacity)
         stop_score = -1.0 if policy.star else 1e-4
     else:
         raise ValueError(f"unknown planner '{planner}'; have: rrt, rrt-star, rrt-connect")

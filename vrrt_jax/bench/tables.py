@@ -209,7 +209,7 @@ def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
         xscale="log",
     )
     times.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
-    times.xaxis.set_major_formatter(LogFormatter())
+    times.xaxis.set_major_formatter("{x:g}")
     lengths.set(xlabel="distance from start to goal [rad]", ylabel="path length [rad]")
     by_level.legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.17))
     causes.legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.17))
