@@ -155,7 +155,8 @@ def test_self_models_come_back(tmp_path):
     vrrt_jax.save_self_model(packed, tmp_path / "copy.npz")
     copy = vrrt_jax.load_self_model(tmp_path / "copy.npz")
     assert copy.info == packed.info and copy.joint_names == packed.joint_names
-    for a, b in zip(packed.levels, copy.levels, strict=True):
+    of_packed, of_copy = (*packed.levels, packed.close_up), (*copy.levels, copy.close_up)
+    for a, b in zip(of_packed, of_copy, strict=True):
         assert (a.size_px, a.psnr_db, a.match_bar) == (b.size_px, b.psnr_db, b.match_bar)
         np.testing.assert_allclose(a.splats.mean, b.splats.mean, atol=1e-3)
     assert [level.size_px for level in packed.levels] == [32, 64, 128, 256]

@@ -1,3 +1,4 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -6,7 +7,7 @@ from PIL import Image
 import vrrt_jax
 from vrrt_jax.problems import camera_from_dict
 from vrrt_jax.splat.camera import project, shrunk
-from vrrt_jax.splat.goal import prepare_goal
+from vrrt_jax.splat.goal import cut_goal, prepare_goal
 
 
 @pytest.fixture
@@ -116,3 +117,19 @@ def test_orbit_looks_from_where_it_says():
     above, _ = project(camera, jnp.array([0.0, 0.0, 0.9]))
     right, _ = project(camera, jnp.array([0.5, 0.0, 0.4]))
     assert above[1] < 240 and right[0] > 240
+
+
+def test_a_part_of_a_goal_is_what_its_camera_sees(camera, image):
+    image[20:40, 30] = (0.2, 0.2, 0.9, 1.0)
+    goal, cameras = prepare_goal([image, image[:, ::-1]], [camera, camera], 60)
+    part, of_part = cut_goal(goal, cameras, np.array([[33.0, 30.0], [79.0, 2.0]]), 24)
+    assert part.rgb.shape == (2, 24, 24, 3) and (of_part.height, of_part.width) == (24, 24)
+    np.testing.assert_array_equal(part.rgb[0], goal.rgb[0, 18:42, 21:45])
+    np.testing.assert_array_equal(part.coverage[1], goal.coverage[1, :24, 56:])  # moved inwards
+    point = jnp.array([0.1, 0.2, 0.5])
+    first = jax.tree.map(lambda leaf: leaf[0], of_part)
+    np.testing.assert_allclose(
+        project(first, point)[0], project(camera, point)[0] - jnp.array([21, 18]), rtol=1e-5
+    )
+    whole, _ = cut_goal(goal, cameras, np.array([[0.0, 0.0], [0.0, 0.0]]), 500)
+    assert whole.coverage.shape == (2, 60, 80)

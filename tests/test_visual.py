@@ -19,13 +19,14 @@ from vrrt_jax.core import tree as trees
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.rewire import with_costs
 from vrrt_jax.core.tree import UNREACHED, lineage
-from vrrt_jax.polish import LOOKS, look_at, polish
+from vrrt_jax.polish import LOOKS, _at_hand, look_at, polish
 from vrrt_jax.sight import Sight, visual_policy, visual_setup
 from vrrt_jax.splat.loss import goal_loss, weighted_goal, weighted_image
 from vrrt_jax.visual import plant
 
 Q_START = np.array([-0.9, 0.5, 0.0, -1.6, 0.0, 2.0, 0.8], np.float32)
 Q_GOAL = np.array([-0.5, 0.3, 0.2, -1.9, 0.1, 2.2, 0.6], np.float32)
+HALF_TURNED = Q_GOAL - np.pi * np.eye(7, dtype=np.float32)[6]
 # Of the default's shapes, and seen by a packaged problem's camera: most programs compile once for
 # all tests that plan.
 QUICK = planner.PlannerConfig(probe_rounds=1, probe_steps=20, max_iterations=150)
@@ -294,14 +295,27 @@ def test_polishing_turns_the_wrist_back(panda, self_model, camera, open_world):
     assert setup.polishing is not None
     polishing = setup.polishing
     turned = Q_GOAL + np.array([0.02, 0, -0.02, 0, 0.05, 0.05, 0.9], np.float32)
-    q, loss = polish(open_world, polishing, turned[None], 0)
-    assert loss[0] < polishing.goal_loss and np.all(np.diff(loss) >= 0)
+    q, loss, cost = polish(open_world, polishing, turned[None], 0)
+    assert loss[0] < polishing.goal_loss and np.all(np.diff(cost) >= 0)
     assert np.abs(np.asarray(q[0]) - Q_GOAL).max() < 0.05
     inside_ball = vrrt_jax.move_obstacle(
         open_world, "ball", position=_hand_position(panda, Q_GOAL), size=(0.2, 0, 0)
     )
-    _, loss = polish(inside_ball, polishing, turned[None], 0)
-    assert not np.isfinite(np.asarray(loss)).any()  # what matches is in collision
+    cost = polish(inside_ball, polishing, turned[None], 0)[2]
+    assert not np.isfinite(cost).any()  # what matches is in collision
+
+
+def test_a_close_up_tells_half_a_turn(panda, self_model, camera, open_world):
+    image = picture(panda, self_model, camera, Q_GOAL, level=3)
+    setup = visual_setup(Sight(panda, self_model, camera, image), Q_START, planner.PlannerConfig())
+    polishing = setup.polishing
+    assert polishing is not None and polishing.close_up is not None
+    closer, goal_loss = _at_hand(open_world, polishing.fine, polishing.close_up, Q_GOAL)
+    assert closer.policy.goal.rgb.shape[1:3] == (polishing.close_up.px,) * 2
+    q = np.resize(np.stack([Q_GOAL, HALF_TURNED]), (LOOKS, 7))
+    seen = [np.asarray(look_at(open_world, at, q)[1]) for at in (polishing.fine, closer)]
+    fine, close = (loss[1] / loss[0] for loss in seen)
+    assert close > fine > 1 and seen[1][0] < goal_loss
 
 
 def _hand_position(panda, q):
@@ -313,8 +327,7 @@ def test_ambiguous_goals_are_told(panda, self_model, camera, open_world):
     image = picture(panda, self_model, camera, Q_GOAL, level=2)
     config = planner.PlannerConfig(match_scale=20.0, polish_rounds=1)
     setup = visual_setup(Sight(panda, self_model, camera, image), Q_START, config)
-    twin = Q_GOAL - np.pi * np.sign(Q_GOAL[6]) * np.eye(7, dtype=np.float32)[6]
-    roots = jnp.asarray(np.stack([Q_START, Q_GOAL, twin]))
+    roots = jnp.asarray(np.stack([Q_START, Q_GOAL, HALF_TURNED]))
     score, payload = setup.policy.roots(open_world, roots)
     tree = trees.create(roots, score, payload, config.capacity)
     found = searches.SearchResult(
@@ -332,7 +345,7 @@ def test_ambiguous_goals_are_told(panda, self_model, camera, open_world):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(finish, "ALIKE", np.inf)
         result = finish.finish_visual(panda, open_world, found, *ends, jax.random.key(0), config)
-    apart = np.abs(result.alternatives - twin).max(axis=1)
+    apart = np.abs(result.alternatives - HALF_TURNED).max(axis=1)
     assert len(apart) >= 1 and apart.min() < 0.3
     assert f"ambiguous: {len(apart)} other" in str(result)
 

@@ -45,6 +45,7 @@ RANGES = {
     "polish_lanes": (1, 1024),
     "polish_kept": (1, 1024),
     "polish_px": (8, 4096),
+    "close_px": (0, 4096),
     "polish_rounds": (1, 1024),
     "polish_steps": (0, 1024),
     "polish_spread": (0.0, np.inf),

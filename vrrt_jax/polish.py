@@ -5,7 +5,8 @@ makes up for another. Each is a valley of the loss of its own, which gradients d
 samples spread widely around the best nodes of a search, with some joints moved and others not, and
 all descend by Levenberg-Marquardt, for which with few joints forward renders suffice. The distinct
 ends start the next round. The last of them descend on a larger image with more splats, which tells
-what the small one does not. What no image tells stays near the start: a weak prior sees to that.
+what the small one does not, and then on a close-up of the hand beside it, where half a turn becomes
+visible. What no image tells stays near the start: a weak prior sees to that.
 """
 
 import dataclasses
@@ -17,14 +18,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.edges import difference, into_limits
+from vrrt_jax.core.kinematics import link_poses
 from vrrt_jax.core.parallel import on_cores
 from vrrt_jax.core.types import pytree
 from vrrt_jax.core.world import World, is_free
+from vrrt_jax.splat.camera import project
+from vrrt_jax.splat.goal import cut_goal
 from vrrt_jax.splat.loss import weighted_goal, weighted_image
 from vrrt_jax.splat.raster import map_lanes
+from vrrt_jax.splat.types import Camera, SplatModel
 from vrrt_jax.visual import VisualPolicy
 
 LOOKS = 4  # configurations looked at in one call: with their differences, a batch of renders
+CLOSE_LOOKS = 2  # the same at a close-up: few ends are left, and each core takes some
 GLANCES = 32  # configurations whose cost alone is asked for, in one call
 PROBE = 2e-4  # [rad] step of the finite differences; longer ones lose the weak directions
 RIDGE = 1e-7  # keeps joints that no pixel sees where they are
@@ -32,6 +38,7 @@ LONGEST = 0.3  # [rad] of one step of a joint
 FEWEST_MOVED = 0.2  # share of its joints that a sample moves, at least, on average
 TURNS = 12  # in which the last joint goes all the way round
 NARROWER = 0.5  # how far samples spread in a round, in units of the round before
+LEAST_COVERED = 0.01  # share of a close-up; a hand that is hidden tells nothing
 DISTINCT = 0.3  # [rad] distance at which configurations count as different
 
 
@@ -45,11 +52,21 @@ class Closer:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class CloseUp:
+    """How to look at the outermost link alone, in full detail."""
+
+    policy: VisualPolicy  # only its loss is used; it sees whole images, of which a part is cut
+    px: int  # height and width of the part
+    match_bar: float  # loss of a match, in units of the part's covered share
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Polishing:
     """How configurations are polished."""
 
     coarse: Closer  # samples descend on this image
     fine: Closer  # and the last of them on this one
+    close_up: CloseUp | None  # and their hands at last here
     coarse_goal_loss: float  # that counts as matched on the coarse image
     goal_loss: float  # and on the fine one
     samples: int  # of a round, in all
@@ -73,12 +90,12 @@ class _Look(NamedTuple):
 
 def polish(
     world: World, polishing: Polishing, q: np.ndarray, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Spread configurations (H, D) and descend.
 
     Returns:
-        Distinct configurations (at most kept, D), best first, and their losses on the fine image;
-        infinite in collision.
+        Distinct configurations (at most kept, D), best first; their losses on the fine image; and
+        their costs, those of a close-up included, infinite in collision.
     """
     rng = np.random.default_rng(seed)
     coarse, fine, steps = polishing.coarse, polishing.fine, polishing.steps
@@ -86,15 +103,21 @@ def polish(
         spread = polishing.spread * NARROWER ** min(k, polishing.rounds - 1)
         samples = _spread(q, polishing.samples, spread, rng)
         cost = _in_blocks(glance, world, coarse, samples, GLANCES)[0]
-        best = _look(world, coarse, samples[np.argsort(cost, kind="stable")[: polishing.lanes]])
-        kept = _distinct(world, _descend(world, coarse, best, steps), polishing.kept)
+        best = samples[np.argsort(cost, kind="stable")[: polishing.lanes]]
+        ends = _descend(lambda q: _look(world, coarse, q), best, steps)
+        kept = _distinct(world, ends, polishing.kept)
         q, matched = kept.q, np.any(kept.free & (kept.cost <= polishing.coarse_goal_loss))
         if matched and k + 1 >= polishing.rounds:
             break
     turned = _turned(world, fine, q, polishing.kept)
-    best = _descend(world, fine, _look(world, fine, turned), steps)
-    kept = _distinct(world, best, polishing.kept)
-    return kept.q, np.where(kept.free, kept.loss, np.inf)
+    ends = _descend(lambda q: _look(world, fine, q), turned, steps)
+    kept = _distinct(world, ends, polishing.kept)
+    loss = kept.loss
+    if polishing.close_up is not None:
+        ends = _descend_closely(world, polishing, polishing.close_up, kept)
+        kept = _distinct(world, ends, polishing.kept)
+        loss = _look(world, fine, kept.q).loss
+    return kept.q, loss, np.where(kept.free, kept.cost, np.inf)
 
 
 def _distinct(world: World, look: _Look, num: int) -> _Look:
@@ -108,9 +131,13 @@ def _distinct(world: World, look: _Look, num: int) -> _Look:
 
 def apart(world: World, q: np.ndarray, q_other: np.ndarray) -> np.ndarray:
     """Distances (n,) of configurations (n, D) from another (D,), the short way round."""
-    step = q - q_other
-    turns = np.round(step / (2 * np.pi)) * np.asarray(world.wraps)
-    return np.linalg.norm(step - 2 * np.pi * turns, axis=1)
+    return np.linalg.norm(_steps(world, q_other, q), axis=1)
+
+
+def _steps(world: World, q_from: np.ndarray, q_to: np.ndarray) -> np.ndarray:
+    """From configurations (n, D) to others, the short way round."""
+    step = q_to - q_from
+    return step - 2 * np.pi * np.round(step / (2 * np.pi)) * np.asarray(world.wraps)
 
 
 def _spread(q: np.ndarray, num: int, spread: float, rng: np.random.Generator) -> np.ndarray:
@@ -139,15 +166,57 @@ def _turned(world: World, closer: Closer, q: np.ndarray, num: int) -> np.ndarray
     return around[order[: min(num, np.sum(allowed))]]
 
 
-def _descend(world: World, closer: Closer, now: _Look, steps: int) -> _Look:
+def _descend_closely(world: World, polishing: Polishing, close_up: CloseUp, ends: _Look) -> _Look:
+    """Descend on the fine image and a close-up of the first one's hand together.
+
+    The cost is the sum of both; the fine image's is taken for the parabola that it is around ends.
+    """
+    closer, goal_loss = _at_hand(world, polishing.fine, close_up, ends.q[0])
+    weight = polishing.goal_loss / goal_loss
+
+    def look(q: np.ndarray) -> _Look:
+        near = _look(world, closer, q, CLOSE_LOOKS)
+        step = _steps(world, ends.q, near.q)
+        bent = np.einsum("nij,nj->ni", ends.matrix, step)
+        return near._replace(
+            cost=ends.cost + np.sum(step * (bent + 2 * ends.slope), axis=1) + weight * near.loss,
+            matrix=ends.matrix + weight * near.matrix,
+            slope=ends.slope + bent + weight * near.slope,
+        )
+
+    return _descend(look, ends.q, polishing.steps)
+
+
+def _at_hand(world: World, fine: Closer, close_up: CloseUp, q: np.ndarray) -> tuple[Closer, float]:
+    """A close-up of the hand that a configuration (D,) has, and the loss of a match there."""
+    whole = close_up.policy
+    middle = np.asarray(_hand_px(world, whole.splats, whole.cameras, q))
+    goal, cameras = cut_goal(whole.goal, whole.cameras, middle, close_up.px)
+    covered = np.sum(goal.valid * goal.coverage) / max(np.sum(goal.valid), 1.0)
+    policy = dataclasses.replace(whole, goal=goal, cameras=cameras)
+    closer = dataclasses.replace(fine, policy=policy, prior=jnp.float32(0))
+    return closer, close_up.match_bar * max(covered, LEAST_COVERED)
+
+
+@jax.jit
+def _hand_px(world: World, splats: SplatModel, cameras: Camera, q: jax.Array) -> jax.Array:
+    """Where (V, 2) the middle of the last link is in V views [px]."""
+    last = splats.link == splats.link[-1]
+    middle = jnp.sum(last[:, None] * splats.mean, axis=0) / jnp.sum(last)
+    pose = link_poses(world.chain, q)[splats.link[-1]]
+    return jax.vmap(project, (0, None))(cameras, pose[:3, :3] @ middle + pose[:3, 3])[0]
+
+
+def _descend(look: Callable[[np.ndarray], _Look], q: np.ndarray, steps: int) -> _Look:
     """Levenberg-Marquardt: steps that lower the cost; those that do not raise the damping."""
+    now = look(q)
     damping = np.full(len(now.q), 1e-3)
     for _ in range(steps):
         diagonal = np.einsum("nii->ni", now.matrix)
         ridge = damping[:, None] * diagonal + RIDGE
         matrix = now.matrix + ridge[:, :, None] * np.eye(now.q.shape[1])
         change = -np.linalg.solve(matrix, now.slope[..., None])[..., 0]
-        tried = _look(world, closer, now.q + np.clip(change, -LONGEST, LONGEST))
+        tried = look(now.q + np.clip(change, -LONGEST, LONGEST))
         better = tried.cost < now.cost
         damping *= np.where(better, 0.3, 4.0)
         now = _Look(
@@ -159,9 +228,9 @@ def _descend(world: World, closer: Closer, now: _Look, steps: int) -> _Look:
     return now
 
 
-def _look(world: World, closer: Closer, q: np.ndarray) -> _Look:
+def _look(world: World, closer: Closer, q: np.ndarray, size: int = LOOKS) -> _Look:
     """Look at configurations (n, D)."""
-    return _Look(*_in_blocks(look_at, world, closer, q, LOOKS))
+    return _Look(*_in_blocks(look_at, world, closer, q, size))
 
 
 def _in_blocks(

@@ -12,7 +12,7 @@ from vrrt_jax import checks
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.kinematics import batch_link_poses
 from vrrt_jax.core.search import Stop, make_stop
-from vrrt_jax.polish import Closer, Polishing
+from vrrt_jax.polish import Closer, CloseUp, Polishing
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.splat.goal import prepare_goal
 from vrrt_jax.splat.model import SelfModel
@@ -55,6 +55,17 @@ class Sight:
         covered = float(jnp.sum(goal.valid * goal.coverage) / jnp.sum(goal.valid))
         fields = {"splats": splats, "windows": windows, "cameras": cameras, "goal": goal}
         return fields, match_scale * level.match_bar * covered
+
+    def close_up(self, policy: VisualPolicy, image_px: int) -> CloseUp:
+        """How to look at a part of images of a height."""
+        goal, cameras = prepare_goal(self.images, self.cameras, image_px, self.masks)
+        level = self.self_model.close_up
+        seen = {"splats": level.splats, "windows": None, "cameras": cameras, "goal": goal}
+        return CloseUp(
+            policy=dataclasses.replace(policy, **seen),
+            px=level.size_px,
+            match_bar=level.match_bar,
+        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -135,6 +146,7 @@ def visual_polishing(
 ) -> Polishing:
     """How matches are looked at after the search."""
     fields, goal_loss = sight.at(config.polish_px, config.match_scale)
+    close_up = sight.close_up(policy, config.close_px) if config.close_px else None
 
     def closer(policy: VisualPolicy, goal_loss: float) -> Closer:
         prior = jnp.float32(config.start_prior * goal_loss)
@@ -143,6 +155,7 @@ def visual_polishing(
     return Polishing(
         coarse=closer(policy, coarse_goal_loss),
         fine=closer(dataclasses.replace(policy, **fields), goal_loss),
+        close_up=close_up,
         coarse_goal_loss=coarse_goal_loss,
         goal_loss=goal_loss,
         samples=config.polish_samples,

@@ -77,7 +77,7 @@ def _self_gap(world: World, poses: jax.Array) -> jax.Array:
     """Smallest difference () of squared distance and squared reach [m^2]."""
     centres = place(world.thin, poses)
     apart = sum((axis[:, None] - axis[None]) ** 2 for axis in centres)
-    return jnp.min(apart - world.reach**2)
+    return jnp.min(apart - world.reach**2, initial=jnp.inf)  # few links have no pair to check
 
 
 def build_world(

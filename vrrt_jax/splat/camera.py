@@ -132,6 +132,11 @@ def shrunk(camera: Camera, factor: int) -> Camera:
     )
 
 
+def cut(camera: Camera, corner: np.ndarray, height: int, width: int) -> Camera:
+    """A part of the same view, whose upper left corner (..., 2) is at x, y [px]."""
+    return dataclasses.replace(camera, centre=camera.centre - corner, height=height, width=width)
+
+
 def stack_cameras(cameras: Sequence[Camera]) -> Camera:
     """Stack V cameras of one size into one whose arrays lead with V."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)

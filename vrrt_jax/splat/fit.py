@@ -1,7 +1,8 @@
 """Train a robot's self-model on MuJoCo's images of its true meshes.
 
 Poses are set kinematically and cameras are exact. Splats start on the visible surface, as depth
-images see it, and are refined photometrically, one level of detail after the other.
+images see it, and are refined photometrically, one level of detail after the other. The last level
+is for a close-up of the outermost link, a hand or a tool, whose turn a whole image hardly tells.
 """
 
 import dataclasses
@@ -21,7 +22,7 @@ from tqdm import tqdm
 from vrrt_jax.core.kinematics import chain_from_model, link_poses
 from vrrt_jax.core.world import batch_is_free, build_world
 from vrrt_jax.robots.robot import workspace
-from vrrt_jax.splat.camera import orbit, shrunk, stack_cameras
+from vrrt_jax.splat.camera import cut, orbit, project, shrunk, stack_cameras
 from vrrt_jax.splat.loss import image_loss, psnr_db
 from vrrt_jax.splat.model import Level, SelfModel, save_self_model
 from vrrt_jax.splat.mujoco_images import MeshRenderer
@@ -60,6 +61,10 @@ class FitConfig:
         LevelConfig(num_splats=1500, size_px=128, steps=600, batch=4),
         LevelConfig(num_splats=5000, size_px=256, steps=300, batch=2),
     )
+    # a part of an image of that height, around the outermost link, at most so far off its middle
+    close_up: LevelConfig = LevelConfig(num_splats=2400, size_px=96, steps=1500, batch=4)
+    close_up_of_px: int = 480
+    close_up_off: float = 0.15  # of the part's height
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -95,22 +100,24 @@ def fit_self_model(robot, spec: mujoco.MjSpec, path: str | Path, *, seed: int, c
     path, started = Path(path), time.perf_counter()
     work = path.with_name(path.name + ".work")
     _claim(work, robot, seed, config)
-    train, points = _cached_images(robot, spec, config, work / "train.npz", seed, surfaces=True)
-    held_out, _ = _cached_images(robot, spec, config, work / "held_out.npz", seed + 1)
+    images = train, _, points = _cached_images(robot, spec, config, work, seed, None)
     levels = []
     for level in config.levels:
         level = dataclasses.replace(level, num_splats=round(config.detail * level.num_splats))
-        levels.append(_fit_level(robot, train, held_out, points, level, config, work, seed))
+        levels.append(_fit_level(robot, *images, level, config, work, seed))
+    images = _cached_images(robot, spec, config, work, seed, outermost(points))
+    close_up = _fit_level(robot, *images, config.close_up, config, work, seed)
     model = SelfModel(
         robot=robot.name,
         joint_names=robot.joint_names,
         levels=tuple(levels),
+        close_up=close_up,
         seed=seed,
         info={
             "num_images": config.num_images,
             "num_validation": config.num_validation,
             "seconds": round(time.perf_counter() - started, 1),
-            "steps": [level.steps for level in config.levels],
+            "steps": [level.steps for level in (*config.levels, config.close_up)],
             "versions": {"jax": jax.__version__, "mujoco": mujoco.__version__},
         },
     )
@@ -148,7 +155,7 @@ def random_configurations(robot, num: int, rng: np.random.Generator) -> np.ndarr
 
 
 def random_camera(
-    config: FitConfig, centre: np.ndarray, radius: float, rng: np.random.Generator
+    config: FitConfig, centre: np.ndarray, radius: float, px: int, rng: np.random.Generator
 ) -> Camera:
     """A camera around a robot whose workspace has a centre (3,) and a radius [m]."""
     return orbit(
@@ -157,15 +164,47 @@ def random_camera(
         distance=radius * rng.uniform(*config.distance),
         target=(centre + rng.normal(size=3) * radius * config.target_spread).tolist(),
         fovy_deg=rng.uniform(*config.fovy_deg),
-        height=config.image_px,
-        width=config.image_px,
+        height=px,
+        width=px,
     )
 
 
+def outermost(points: np.ndarray) -> tuple[int, np.ndarray]:
+    """The last link of surface points (m, 7), and their middle (3,) in its frame [m]."""
+    link = points[:, 0].max()
+    return int(link), points[points[:, 0] == link, 1:4].mean(axis=0)
+
+
+def close_up_camera(
+    robot, config: FitConfig, q: np.ndarray, camera: Camera, tip: tuple[int, np.ndarray], off
+) -> Camera:
+    """The part of a view around a point of a link, ``off`` (2,) heights away from its middle."""
+    link, point = tip
+    pose = np.asarray(link_poses(robot.chain, jnp.asarray(q, jnp.float32)))[link]
+    pixel, _ = project(camera, pose[:3, :3] @ point + pose[:3, 3])
+    px = config.close_up.size_px
+    return cut(camera, np.round(np.asarray(pixel) + (off - 0.5) * px), px, px)
+
+
 def render_images(
-    robot, spec: mujoco.MjSpec, config: FitConfig, num: int, seed: int, num_surfaces: int = 0
+    robot,
+    spec: mujoco.MjSpec,
+    config: FitConfig,
+    num: int,
+    seed: int,
+    num_surfaces: int = 0,
+    tip: tuple[int, np.ndarray] | None = None,
 ) -> tuple[Images, np.ndarray]:
     """Render n images of random poses from random cameras; and surface points with colours.
+
+    Args:
+        robot: the robot.
+        spec: with its visual meshes.
+        config: sizes and ranges.
+        num: n.
+        seed: of poses and cameras.
+        num_surfaces: images, of the n, that surface points are taken from.
+        tip: a link and a point (3,) of it [m]: the images are close-ups of it.
 
     Returns:
         The images; points (m, 7): link, position in the link's frame [m], colour.
@@ -175,8 +214,15 @@ def render_images(
     rng = np.random.default_rng(seed)
     q = random_configurations(robot, num, rng)
     centre, radius = workspace(robot)
-    cameras = [random_camera(config, centre, radius, rng) for _ in range(num)]
-    rgb = np.zeros((num, config.image_px, config.image_px, 3), np.float16)
+    px = config.image_px if tip is None else config.close_up_of_px
+    cameras = [random_camera(config, centre, radius, px, rng) for _ in range(num)]
+    if tip is not None:
+        off = rng.uniform(-config.close_up_off, config.close_up_off, (num, 2))
+        cameras = [
+            close_up_camera(robot, config, *each)
+            for each in zip(q, cameras, [tip] * num, off, strict=True)
+        ]
+    rgb = np.zeros((num, cameras[0].height, cameras[0].width, 3), np.float16)
     coverage = np.zeros(rgb.shape[:3], np.float16)
     points = []
     for i in tqdm(range(num), desc="rendering", unit="image", leave=False):
@@ -206,31 +252,48 @@ def _surface_points(robot, q, camera: Camera, depth, link, inside, rgb) -> np.nd
     return np.concatenate([link[y, x, None], local, rgb[y, x]], axis=1).astype(np.float32)
 
 
-def _cached_images(robot, spec, config, file: Path, seed: int, surfaces: bool = False):
-    num = config.num_images if surfaces else config.num_validation
-    num_surfaces = config.num_surface_images if surfaces else 0
-    if not file.exists():
-        images, points = render_images(robot, spec, config, num, seed, num_surfaces)
-        part = file.with_suffix(".part")
-        with open(part, "wb") as handle:
-            np.savez(
-                handle,
-                q=images.q,
-                rgb=images.rgb,
-                coverage=images.coverage,
-                points=points,
-                world_to_cam=np.asarray(images.cameras.world_to_cam),
-                focal=np.asarray(images.cameras.focal),
-                centre=np.asarray(images.cameras.centre),
-            )
-        part.replace(file)
+def _cached_images(
+    robot, spec, config: FitConfig, work: Path, seed: int, tip
+) -> tuple[Images, Images, np.ndarray]:
+    """Images for training and for validation, and surface points; close-ups if there is a tip."""
+    kind = "whole" if tip is None else "close_up"
+
+    def cached(use: str, *numbers: int) -> tuple[Images, np.ndarray]:
+        file = work / f"{kind}_{use}.npz"
+        if not file.exists():
+            _write_images(file, *render_images(robot, spec, config, *numbers, tip=tip))
+        return _read_images(file)
+
+    train, points = cached("train", config.num_images, seed, config.num_surface_images)
+    held_out, _ = cached("held_out", config.num_validation, seed + 1)
+    return train, held_out, points
+
+
+def _write_images(file: Path, images: Images, points: np.ndarray) -> None:
+    part = file.with_suffix(".part")
+    with open(part, "wb") as handle:
+        np.savez(
+            handle,
+            q=images.q,
+            rgb=images.rgb,
+            coverage=images.coverage,
+            points=points,
+            world_to_cam=np.asarray(images.cameras.world_to_cam),
+            focal=np.asarray(images.cameras.focal),
+            centre=np.asarray(images.cameras.centre),
+        )
+    part.replace(file)
+
+
+def _read_images(file: Path) -> tuple[Images, np.ndarray]:
     with np.load(file) as saved:
+        height, width = saved["coverage"].shape[1:]
         cameras = Camera(
             world_to_cam=jnp.asarray(saved["world_to_cam"]),
             focal=jnp.asarray(saved["focal"]),
             centre=jnp.asarray(saved["centre"]),
-            height=config.image_px,
-            width=config.image_px,
+            height=height,
+            width=width,
         )
         images = Images(q=saved["q"], cameras=cameras, rgb=saved["rgb"], coverage=saved["coverage"])
         return images, saved["points"]

@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from vrrt_jax.splat.camera import shrunk, stack_cameras
+from vrrt_jax.splat.camera import cut, shrunk, stack_cameras
 from vrrt_jax.splat.types import Camera, GoalImage
 
 BACKGROUND_TOLERANCE = 0.06  # colour difference that still counts as background
@@ -92,6 +93,28 @@ def prepare_goal(
     rgb, coverage, valid = (jnp.asarray(np.stack([v[i] for v in views])) for i in range(3))
     goal = GoalImage(rgb=rgb, coverage=coverage, valid=valid)
     return goal, stack_cameras([view[3] for view in views])
+
+
+def cut_goal(
+    goal: GoalImage, cameras: Camera, middle: np.ndarray, px: int
+) -> tuple[GoalImage, Camera]:
+    """A part of each of V goal images, and the cameras that see it alone.
+
+    Args:
+        goal: whole images (V, H, W, ...).
+        cameras: V cameras of them.
+        middle: (V, 2) of the parts, x, y [px]; moved inwards at the border.
+        px: height and width of a part, or what the image has.
+    """
+    size = np.minimum(px, [cameras.width, cameras.height])
+    corner = np.clip(np.round(middle - size / 2), 0, [cameras.width, cameras.height] - size)
+    (width, height), corner = size.tolist(), corner.astype(int)
+
+    def parts(images: jax.Array) -> np.ndarray:
+        views = zip(np.asarray(images), corner, strict=True)
+        return np.stack([view[y : y + height, x : x + width] for view, (x, y) in views])
+
+    return jax.tree.map(parts, goal), cut(cameras, corner, height, width)
 
 
 def _checked(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

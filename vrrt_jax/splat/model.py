@@ -11,7 +11,8 @@ import numpy as np
 
 from vrrt_jax.splat.types import SplatModel
 
-FORMAT = 2
+FORMAT = 3
+CLOSE_UP = "close_up"
 ARRAYS = ("mean", "radius", "density", "rgb", "shade", "link", "tau")
 
 
@@ -32,6 +33,7 @@ class SelfModel:
     robot: str
     joint_names: tuple[str, ...]
     levels: tuple[Level, ...]  # by rising size
+    close_up: Level  # for a part of a larger image, around the outermost link
     seed: int
     info: dict[str, Any]  # how it was trained: numbers of images, steps, seconds, versions
 
@@ -44,28 +46,29 @@ class SelfModel:
 def save_self_model(model: SelfModel, path: str | Path) -> None:
     """Write a compressed ``.npz``, atomically."""
     path = Path(path)
+    named = {**{str(i): level for i, level in enumerate(model.levels)}, CLOSE_UP: model.close_up}
     header = {
         "format": FORMAT,
         "robot": model.robot,
         "joint_names": list(model.joint_names),
         "seed": model.seed,
         "info": model.info,
-        "levels": [
-            {
-                "size_px": v.size_px,
-                "psnr_db": v.psnr_db,
-                "match_bar": v.match_bar,
-                "starts": v.splats.starts,
+        "levels": {
+            name: {
+                "size_px": level.size_px,
+                "psnr_db": level.psnr_db,
+                "match_bar": level.match_bar,
+                "starts": level.splats.starts,
             }
-            for v in model.levels
-        ],
+            for name, level in named.items()
+        },
     }
     arrays: dict[str, Any] = {"header": np.array(json.dumps(header))}
-    for i, level in enumerate(model.levels):
-        for name in ARRAYS:
-            value = np.asarray(getattr(level.splats, name))
-            small = np.uint8 if name == "link" else np.float16 if value.ndim else np.float32
-            arrays[f"{i}/{name}"] = value.astype(small)
+    for name, level in named.items():
+        for array in ARRAYS:
+            value = np.asarray(getattr(level.splats, array))
+            small = np.uint8 if array == "link" else np.float16 if value.ndim else np.float32
+            arrays[f"{name}/{array}"] = value.astype(small)
     part = path.with_name(path.name + ".part")
     with open(part, "wb") as file:
         np.savez_compressed(file, **arrays)
@@ -95,14 +98,14 @@ def load_self_model(path: str | Path) -> SelfModel:
             f"'{path}' has self-model format {header.get('format')}, expected {FORMAT}; train it "
             "again with: vrrt fit"
         )
-    levels = tuple(
-        Level(
+    levels = {
+        name: Level(
             splats=SplatModel(
                 **{
-                    name: jnp.asarray(
-                        arrays[f"{i}/{name}"], jnp.int32 if name == "link" else jnp.float32
+                    array: jnp.asarray(
+                        arrays[f"{name}/{array}"], jnp.int32 if array == "link" else jnp.float32
                     )
-                    for name in ARRAYS
+                    for array in ARRAYS
                 },
                 starts=tuple(numbers["starts"]),
             ),
@@ -110,12 +113,14 @@ def load_self_model(path: str | Path) -> SelfModel:
             psnr_db=numbers["psnr_db"],
             match_bar=numbers["match_bar"],
         )
-        for i, numbers in enumerate(header["levels"])
-    )
+        for name, numbers in header["levels"].items()
+    }
+    close_up = levels.pop(CLOSE_UP)
     return SelfModel(
         robot=header["robot"],
         joint_names=tuple(header["joint_names"]),
-        levels=levels,
+        levels=tuple(levels.values()),
+        close_up=close_up,
         seed=header["seed"],
         info=header["info"],
     )
