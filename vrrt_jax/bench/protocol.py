@@ -26,6 +26,7 @@ ABLATIONS = {
         "probe_steps": (0,),
         "hypotheses": (0, 1),
         "polish_rounds": (1,),
+        "close_px": (0,),
         "start_prior": (0.0,),
         "start_preference": (0.0,),
         "anneal": (0.0,),
