@@ -48,6 +48,26 @@ def test_masked_pixels_do_not_count(camera, image):
     assert float(goal.valid.sum()) == 60 * 40
 
 
+def test_scattered_holes_leave_the_rest(camera, image, rng):
+    mask = rng.random(image.shape[:2]) < 0.85
+    holed = np.where(mask[..., None], image, 1.0)  # what is in the holes is unknown
+    whole, _ = prepare_goal([image], [camera], 15)
+    goal, _ = prepare_goal([holed], [camera], 15, [mask])
+    kept = np.asarray(goal.valid[0]) > 0
+    assert kept.mean() > 0.8 and float(goal.valid[0][kept].min()) >= 0.75
+    inside = kept & (np.asarray(whole.coverage[0]) == 1.0)
+    np.testing.assert_allclose(goal.coverage[0][inside], 1.0, atol=1e-6)
+    np.testing.assert_allclose(goal.rgb[0][inside], whole.rgb[0][inside], atol=0.05)
+
+
+def test_one_mask_for_two_views_is_refused(camera, image):
+    mask = np.ones((60, 80), bool)
+    goal, _ = prepare_goal(np.stack([image, image]), [camera, camera], 60)
+    assert goal.rgb.shape[0] == 2
+    with pytest.raises(ValueError, match="got 1 masks for 2 goal images"):
+        prepare_goal([image, image], [camera, camera], 60, [mask])
+
+
 def test_image_files_come_back(tmp_path, image):
     vrrt_jax.write_image(tmp_path / "a.png", image[..., :3] * image[..., 3:], image[..., 3])
     np.testing.assert_allclose(vrrt_jax.read_image(tmp_path / "a.png"), image, atol=3e-3)

@@ -266,10 +266,39 @@ def test_weighted_images_make_the_loss(panda, self_model, camera, image, rng):
     mask = rng.random(image.shape[:2]) < 0.8
     sight = Sight(panda, self_model, [camera, camera], [image, image], [mask, mask])
     policy, _ = visual_policy(sight, Q_START, QUICK)
+    assert 0.5 < float(policy.goal.valid.mean()) < 0.9
     q = jnp.asarray(Q_START)
     args = (panda.chain, policy.splats, policy.cameras, policy.goal, q, policy.windows)
     apart = jax.jit(weighted_image)(*args) - weighted_goal(policy.goal)
     assert float(jnp.sum(apart**2)) == pytest.approx(float(goal_loss(*args)), rel=1e-4)
+
+
+def test_a_mask_that_hides_the_robot_is_refused(panda, self_model, camera, image, open_world):
+    hiding = image[..., 3] == 0
+    with pytest.raises(ValueError, match="the masks leave nothing of the robot"):
+        vrrt_jax.plan(
+            panda,
+            open_world,
+            self_model,
+            camera,
+            image,
+            Q_START,
+            key=jax.random.key(0),
+            mask=hiding,
+        )
+
+
+def test_holes_in_the_image_are_planned_around(panda, self_model, camera, open_world):
+    image = picture(panda, self_model, camera, Q_GOAL, level=3)
+    mask = np.random.default_rng(0).random(image.shape[:2]) < 0.9
+    mask[360:] = False  # the foot of the robot
+    holed = np.where(mask[..., None], image, 1.0)
+    key = jax.random.key(2)
+    result = vrrt_jax.plan(
+        panda, open_world, self_model, camera, holed, Q_START, key=key, config=QUICK, mask=mask
+    )
+    assert result.ok, str(result)
+    assert np.abs(result.q_goal - Q_GOAL).max() < 0.05
 
 
 def test_looks_lead_where_the_gradient_does(panda, self_model, camera, image, open_world):

@@ -23,7 +23,7 @@ RANGES = {
     "eta": (0.0, 1.0),
     "exploration": (0.0, 1.0),
     "anneal": (0.0, np.inf),
-    "match_scale": (0.0, np.inf),
+    "match_scale": (1e-9, np.inf),
     "rewire_radius": (0.0, np.inf),
     "min_improvement": (0.0, np.inf),
     "verify_step": (1e-4, 1.0),

@@ -252,7 +252,7 @@ def _fit(arguments: argparse.Namespace) -> int:
         config = dataclasses.replace(config, num_images=arguments.images)
     _writable(Path(arguments.out).parent)
     model = fit_self_model(robot, _meshes(robot), arguments.out, seed=arguments.seed, config=config)
-    for level in model.levels:
+    for level in (*model.levels, model.close_up):
         print(
             f"{level.splats.num_splats} splats at {level.size_px} px: {level.psnr_db:.1f} dB on "
             f"{model.info['num_validation']} unseen poses and cameras, match bar "

@@ -42,8 +42,8 @@ class PlannerConfig:
     polish_steps: int = 4  # Levenberg-Marquardt, in each round and at the end
     polish_px: int = 128  # image height at the end (re-compiles)
     close_px: int = 480  # image height of which a close-up of the hand is seen last; 0 = none
-    start_prior: float = 0.005  # goal losses that a radian from the start costs then
-    start_preference: float = 0.007  # share of the loss that a squared radian from it counts for
+    start_prior: float = 0.005  # goal losses that a squared radian from the start costs then
+    start_preference: float = 0.007  # share of its cost that a match's squared distance adds
     inherit: bool = True  # a child goes on with its parent's Adam moments
     rewiring: bool = True  # RRT* (re-compiles)
     rewire_radius: float = 0.3  # [rad]

@@ -62,10 +62,10 @@ def finish_visual(
     if polishing is not None and not hurried:
         goal_loss = polishing.goal_loss
         nodes = list(_distinct(world, score, q, q_start, config.hypotheses, np.inf))
-        found, (q, score, doubt) = _polished(found, world, polishing, q[nodes], key)
+        found, (q, score, cost) = _polished(found, world, polishing, q[nodes], key)
         far = apart(world, q, q_start) ** 2  # of two that look alike, the nearer is likelier
-        order = np.argsort(doubt * (1.0 + config.start_preference * far), kind="stable")
-        ends = [int(k) for k in order if np.isfinite(doubt[k])] or [0]
+        order = np.lexsort([cost * (1.0 + config.start_preference * far), score > goal_loss])
+        ends = [int(k) for k in order if np.isfinite(cost[k])] or [0]
         paths, rivals = {}, ends
     else:
         if hurried and score.min() > goal_loss:  # nothing matches: the best that a path leads to
@@ -73,7 +73,7 @@ def finish_visual(
         ends = list(_distinct(world, score, q, q_start, TRIED, goal_loss))
         paths = {end: tree_path(found.tree, end) for end in ends}
         paths = {end: path for end, path in paths.items() if np.array_equal(path[0], q_start)}
-        rivals, doubt = [], score  # on a small image even neighbours look the same
+        rivals, cost = [], score  # on a small image even neighbours look the same
     for end in ends[:TRIED]:
         path = paths.get(end)
         if path is None:
@@ -84,7 +84,7 @@ def finish_visual(
         end, path = ends[0], None
     target, loss = q[end], float(score[end])
     matching = [k for k in rivals if score[k] <= goal_loss]
-    alike = [k for k in matching if k != end and doubt[k] <= ALIKE * doubt[end]]
+    alike = [k for k in matching if k != end and cost[k] <= ALIKE * cost[end]]
     result = finish(robot, world, found, path, target, loss, goal_loss, key, config, q_start)
     for again in range(1, REFUSED):
         if hurried or result.status is not Status.NOT_VERIFIED:

@@ -101,7 +101,7 @@ def polish(
     coarse, fine, steps = polishing.coarse, polishing.fine, polishing.steps
     for k in range(2 * polishing.rounds):
         spread = polishing.spread * NARROWER ** min(k, polishing.rounds - 1)
-        samples = _spread(q, polishing.samples, spread, rng)
+        samples = _spread(q, _last_hinge(world), polishing.samples, spread, rng)
         cost = _in_blocks(glance, world, coarse, samples, GLANCES)[0]
         best = samples[np.argsort(cost, kind="stable")[: polishing.lanes]]
         ends = _descend(lambda q: _look(world, coarse, q), best, steps)
@@ -140,11 +140,19 @@ def _steps(world: World, q_from: np.ndarray, q_to: np.ndarray) -> np.ndarray:
     return step - 2 * np.pi * np.round(step / (2 * np.pi)) * np.asarray(world.wraps)
 
 
-def _spread(q: np.ndarray, num: int, spread: float, rng: np.random.Generator) -> np.ndarray:
+def _last_hinge(world: World) -> int:
+    """The joint that turns the hand, behind which there may be sliding fingers."""
+    hinges = np.flatnonzero(~np.any(np.asarray(world.chain.slide), axis=(1, 2)))
+    return int(hinges[-1]) if len(hinges) else -1
+
+
+def _spread(
+    q: np.ndarray, hinge: int, num: int, spread: float, rng: np.random.Generator
+) -> np.ndarray:
     """Samples (num, D) around configurations (H, D), which are the first of them."""
     # Grippers look alike after half a turn of the last joint.
     turned = q.copy()
-    turned[:, -1] += np.where(q[:, -1] > 0, -np.pi, np.pi)
+    turned[:, hinge] += np.where(q[:, hinge] > 0, -np.pi, np.pi)
     shape = (-(-num // len(q)), *q.shape)
     moved = rng.uniform(size=shape) < rng.uniform(FEWEST_MOVED, 1.0, (*shape[:2], 1))
     around = q + spread * moved * rng.normal(size=shape)
@@ -158,7 +166,7 @@ def _turned(world: World, closer: Closer, q: np.ndarray, num: int) -> np.ndarray
     """
     joints = q.shape[1]
     turn = 2 * np.pi / TURNS * np.arange(TURNS)
-    around = (q[:, None] + turn[:, None] * np.eye(joints)[-1]).reshape(-1, joints)
+    around = (q[:, None] + turn[:, None] * np.eye(joints)[_last_hinge(world)]).reshape(-1, joints)
     cost = _in_blocks(glance, world, closer, around, GLANCES)[0].reshape(-1, TURNS)
     allowed = (cost < np.roll(cost, 1, axis=1)) & (cost <= np.roll(cost, -1, axis=1))
     allowed[:, 0] = True
@@ -192,10 +200,12 @@ def _at_hand(world: World, fine: Closer, close_up: CloseUp, q: np.ndarray) -> tu
     whole = close_up.policy
     middle = np.asarray(_hand_px(world, whole.splats, whole.cameras, q))
     goal, cameras = cut_goal(whole.goal, whole.cameras, middle, close_up.px)
-    covered = np.sum(goal.valid * goal.coverage) / max(np.sum(goal.valid), 1.0)
+    # The fewer of its pixels are known, the less it says.
+    known = max(float(np.mean(goal.valid)), 1e-6)
+    covered = float(np.mean(goal.valid * goal.coverage)) / known
     policy = dataclasses.replace(whole, goal=goal, cameras=cameras)
     closer = dataclasses.replace(fine, policy=policy, prior=jnp.float32(0))
-    return closer, close_up.match_bar * max(covered, LEAST_COVERED)
+    return closer, close_up.match_bar * max(covered, LEAST_COVERED) / known
 
 
 @jax.jit

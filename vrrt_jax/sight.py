@@ -20,6 +20,8 @@ from vrrt_jax.splat.raster import LANES, Windows, choose_windows
 from vrrt_jax.splat.types import Camera, SplatModel
 from vrrt_jax.visual import Probing, VisualPolicy
 
+LEAST_HEIGHT = 0.75  # of an image for a close-up, in units of the height that it is meant for
+
 
 class Sight:
     """A robot's goal images, to be compared with at any resolution.
@@ -48,23 +50,34 @@ class Sight:
         self.cameras, self.images, self.masks = camera, goal_image, mask
 
     def at(self, image_px: int, match_scale: float) -> tuple[dict[str, Any], float]:
-        """Fields of a :class:`VisualPolicy` for images of a height, and the loss of a match."""
+        """Fields of a :class:`VisualPolicy` for images of a height, and the loss of a match.
+
+        Raises:
+            ValueError: the masks leave nothing of the robot.
+        """
         goal, cameras = prepare_goal(self.images, self.cameras, image_px, self.masks)
+        if not jnp.any(goal.valid * goal.coverage > 0):
+            raise ValueError(
+                f"the masks leave nothing of the robot on images of {goal.coverage.shape[1]} px; "
+                "a larger image_px, probe_px and polish_px keep more where many pixels are hidden"
+            )
         level = self.self_model.level_for(goal.coverage.shape[1])
         splats, windows = _windowed(self.robot, level.splats, cameras)
         covered = float(jnp.sum(goal.valid * goal.coverage) / jnp.sum(goal.valid))
         fields = {"splats": splats, "windows": windows, "cameras": cameras, "goal": goal}
         return fields, match_scale * level.match_bar * covered
 
-    def close_up(self, policy: VisualPolicy, image_px: int) -> CloseUp:
-        """How to look at a part of images of a height."""
+    def close_up(self, policy: VisualPolicy, image_px: int, match_scale: float) -> CloseUp | None:
+        """How to look at a part of images of a height; not at all, where they are much smaller."""
         goal, cameras = prepare_goal(self.images, self.cameras, image_px, self.masks)
+        if goal.coverage.shape[1] < LEAST_HEIGHT * image_px:
+            return None
         level = self.self_model.close_up
         seen = {"splats": level.splats, "windows": None, "cameras": cameras, "goal": goal}
         return CloseUp(
             policy=dataclasses.replace(policy, **seen),
             px=level.size_px,
-            match_bar=level.match_bar,
+            match_bar=match_scale * level.match_bar,
         )
 
 
@@ -146,7 +159,7 @@ def visual_polishing(
 ) -> Polishing:
     """How matches are looked at after the search."""
     fields, goal_loss = sight.at(config.polish_px, config.match_scale)
-    close_up = sight.close_up(policy, config.close_px) if config.close_px else None
+    close_px, match_scale = config.close_px, config.match_scale
 
     def closer(policy: VisualPolicy, goal_loss: float) -> Closer:
         prior = jnp.float32(config.start_prior * goal_loss)
@@ -155,7 +168,7 @@ def visual_polishing(
     return Polishing(
         coarse=closer(policy, coarse_goal_loss),
         fine=closer(dataclasses.replace(policy, **fields), goal_loss),
-        close_up=close_up,
+        close_up=sight.close_up(policy, close_px, match_scale) if close_px else None,
         coarse_goal_loss=coarse_goal_loss,
         goal_loss=goal_loss,
         samples=config.polish_samples,

@@ -54,7 +54,7 @@ class FitConfig:
     distance: tuple[float, float] = (1.5, 2.6)
     target_spread: float = 0.15
     learning_rate: float = 0.1
-    detail: float = 1.0  # times the levels' numbers of splats; large robots need more
+    detail: float = 1.0  # times the splats of all levels but the close-up; large robots need more
     levels: tuple[LevelConfig, ...] = (
         LevelConfig(num_splats=300, size_px=32, steps=1000, batch=8),
         LevelConfig(num_splats=600, size_px=64, steps=1500, batch=6),
@@ -104,9 +104,10 @@ def fit_self_model(robot, spec: mujoco.MjSpec, path: str | Path, *, seed: int, c
     levels = []
     for level in config.levels:
         level = dataclasses.replace(level, num_splats=round(config.detail * level.num_splats))
-        levels.append(_fit_level(robot, *images, level, config, work, seed))
+        name = f"level_{len(levels)}"
+        levels.append(_fit_level(robot, *images, level, name, config, work, seed))
     images = _cached_images(robot, spec, config, work, seed, outermost(points))
-    close_up = _fit_level(robot, *images, config.close_up, config, work, seed)
+    close_up = _fit_level(robot, *images, config.close_up, "close_up", config, work, seed)
     model = SelfModel(
         robot=robot.name,
         joint_names=robot.joint_names,
@@ -323,6 +324,7 @@ def initial_splats(points: np.ndarray, num_splats: int, seed: int) -> SplatModel
     # The square root keeps small but telling links, such as fingers, from starving.
     shares = np.sqrt(counts)
     quota = np.maximum(8, np.floor(shares / shares.sum() * num_splats)).astype(int)
+    quota = np.minimum(quota, counts)
     quota[np.argmax(quota)] += num_splats - quota.sum()
     mean, radius, rgb, link = [], [], [], []
     for index, num in zip(links, quota, strict=True):
@@ -368,11 +370,12 @@ def _fit_level(
     held_out: Images,
     points: np.ndarray,
     level: LevelConfig,
+    name: str,
     config: FitConfig,
     work: Path,
     seed: int,
 ) -> Level:
-    file = work / f"level_{level.size_px}_{level.num_splats}.npz"
+    file = work / f"{name}.npz"
     train, held_out = shrink(train, level.size_px), shrink(held_out, level.size_px)
     start = initial_splats(points, level.num_splats, seed)
     change = {

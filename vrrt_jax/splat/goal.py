@@ -12,6 +12,7 @@ from vrrt_jax.splat.camera import cut, shrunk, stack_cameras
 from vrrt_jax.splat.types import Camera, GoalImage
 
 BACKGROUND_TOLERANCE = 0.06  # colour difference that still counts as background
+KNOWN = 0.75  # share of a shrunk pixel that has to be valid, for its mean to stand for all of it
 
 
 def read_image(path: str | Path) -> np.ndarray:
@@ -62,26 +63,34 @@ def prepare_goal(
         masks: (H, W) bool, False where a pixel is unknown or occluded.
 
     Returns:
-        The goal (V, h, w, ...), and the V cameras stacked.
+        The goal (V, h, w, ...), whose ``valid`` is the share of a pixel that is, or 0 where that is
+        little; and the V cameras stacked.
 
     Raises:
         ValueError: what is wrong with an image, and what to do.
     """
-    if len(images) != len(cameras) or not images:
+    if len(images) != len(cameras) or len(images) == 0:
         raise ValueError(
             f"got {len(images)} goal images and {len(cameras)} cameras; give one camera an image"
         )
     masks = masks if masks is not None else [None] * len(images)
+    if len(masks) != len(images):
+        raise ValueError(
+            f"got {len(masks)} masks for {len(images)} goal images; give a list with one, or None, "
+            "for each"
+        )
     views = []
     for image, camera, mask in zip(images, cameras, masks, strict=True):
         rgb, coverage = _checked(np.asarray(image), camera)
         valid = np.ones_like(coverage) if mask is None else _checked_mask(mask, camera)
         factor = max(1, round(camera.height / image_px))
+        share = _blocks(valid, factor)
+        known = np.maximum(share, 1e-6)
         views.append(
             (
-                _blocks(rgb, factor),
-                _blocks(coverage, factor),
-                (_blocks(valid, factor) > 0.999).astype(np.float32),
+                _blocks(rgb * valid[..., None], factor) / known[..., None],
+                _blocks(coverage * valid, factor) / known,
+                np.where(share >= KNOWN, share, 0.0).astype(np.float32),
                 shrunk(camera, factor),
             )
         )
