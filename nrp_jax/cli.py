@@ -93,11 +93,14 @@ def _plan(arguments: argparse.Namespace) -> int:
     out = Path(arguments.out)
     out.mkdir(parents=True, exist_ok=True)
     (out / "path.json").write_text(json.dumps(_record(robot.name, arguments, result), indent=1))
+    print(result)
     if not arguments.no_pictures:
         from nrp_jax.viz import save_plan
 
-        save_plan(out / "plan.png", robot, grid, world, result, arguments.goal)
-    print(result)
+        try:
+            save_plan(out / "plan.png", robot, grid, world, result, arguments.goal)
+        except ModuleNotFoundError:
+            print("no figure: matplotlib is missing; pip install 'vrrt-jax[plot]'", file=sys.stderr)
     if not result.ok:
         problem = result.verification.problem if result.verification else None
         print(f"{result.status.value}{f' ({problem})' if problem else ''}", file=sys.stderr)

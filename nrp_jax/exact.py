@@ -117,8 +117,13 @@ def _motion_problem(
 
 
 def _solid_boxes(grid: Grid, planar: bool) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Boxes (corner, corner) that are the solid cells, and four around the map."""
+    """Boxes (corner, corner) that are the solid cells, and four around the map.
+
+    Those of a planar map are around z = 0, where a planar robot is.
+    """
     origin = np.array(grid.origin)
+    if planar:
+        origin[2] = 0.0
     tall = np.array([0.0, 0.0, 1.0]) if planar else np.zeros(3)
     boxes = [
         (origin + low * grid.resolution - tall, origin + high * grid.resolution + tall)

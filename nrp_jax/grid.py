@@ -10,6 +10,7 @@ from PIL import Image, UnidentifiedImageError
 
 RESOLUTION = 0.1  # [m]
 HEIGHT = 2.0  # of a home [m]
+_UNKNOWN = 0.196  # just below the occupancy of ROS's grey 205, which stands for unknown
 _PROBE = "cell"
 
 
@@ -17,12 +18,42 @@ _PROBE = "cell"
 class Grid:
     """Solid cells; cell (i, j, k) covers ``[i, i + 1) * resolution + origin`` and so on.
 
-    A map of one layer (Z = 1) is planar. Everything outside in x and y is solid.
+    A map of one layer (Z = 1) is planar. Everything outside in x and y is solid. An array (X, Y), 0
+    and 1 in place of booleans and an origin without a height are taken too.
+
+    Raises:
+        ValueError: wrong rank, empty, other values, a resolution that is not positive, or an origin
+            that is no place.
     """
 
     occupied: np.ndarray  # (X, Y, Z) bool
     resolution: float = RESOLUTION  # [m]
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # corner of cell (0, 0, 0) [m]
+    origin: tuple[float, ...] = (0.0, 0.0, 0.0)  # corner of cell (0, 0, 0) [m]
+
+    def __post_init__(self):
+        """Check and convert the fields."""
+        occupied, resolution = np.asarray(self.occupied), float(self.resolution)
+        if occupied.ndim not in (2, 3) or 0 in occupied.shape:
+            raise ValueError(
+                f"the map has shape {occupied.shape}; expected (X, Y) or (X, Y, Z) with cells in it"
+            )
+        if occupied.dtype != bool:
+            values = np.unique(occupied)
+            if not np.isin(values, [0, 1]).all():
+                raise ValueError(
+                    f"the map holds values from {values[0]} to {values[-1]}; expected booleans, "
+                    "True where a cell is solid: apply a threshold first"
+                )
+        if not (np.isfinite(resolution) and resolution > 0):
+            raise ValueError(f"the map's resolution is {resolution}; expected metres, such as 0.1")
+        origin = tuple(float(v) for v in self.origin)
+        if len(origin) not in (2, 3) or not np.isfinite(origin).all():
+            raise ValueError(f"the map's origin is {origin}; expected x, y and perhaps z in metres")
+        if occupied.ndim == 2:
+            occupied = occupied[:, :, None]
+        object.__setattr__(self, "occupied", occupied.astype(bool, copy=False))
+        object.__setattr__(self, "resolution", resolution)
+        object.__setattr__(self, "origin", (*origin, 0.0)[:3])
 
     @property
     def planar(self) -> bool:
@@ -82,45 +113,13 @@ class Grid:
         )
 
 
-def make_grid(
-    occupied: np.ndarray, resolution: float = RESOLUTION, origin: tuple[float, ...] = (0, 0, 0)
-) -> Grid:
-    """A checked grid from an array (X, Y) or (X, Y, Z) of booleans or of 0 and 1.
-
-    Raises:
-        ValueError: wrong rank, empty, other values, or a resolution that is not positive.
-    """
-    occupied = np.asarray(occupied)
-    if occupied.ndim not in (2, 3) or 0 in occupied.shape:
-        raise ValueError(
-            f"the map has shape {occupied.shape}; expected (X, Y) or (X, Y, Z) with cells in it"
-        )
-    if occupied.dtype != bool:
-        values = np.unique(occupied)
-        if not np.isin(values, [0, 1]).all():
-            raise ValueError(
-                f"the map holds values from {values[0]} to {values[-1]}; expected booleans, True "
-                "where a cell is solid: apply a threshold first"
-            )
-    if not (np.isfinite(resolution) and resolution > 0):
-        raise ValueError(f"the map's resolution is {resolution}; expected metres, such as 0.1")
-    if occupied.ndim == 2:
-        occupied = occupied[:, :, None]
-    x, y, z = (*origin, 0.0)[:3]
-    return Grid(
-        occupied=occupied.astype(bool),
-        resolution=float(resolution),
-        origin=(float(x), float(y), float(z)),
-    )
-
-
 def load_map(path: str | Path) -> Grid:
     """Read a map.
 
     Args:
         path: ``.npz`` with ``occupied``, ``resolution_m`` and ``origin_m``; a ROS map's ``.yaml``
-            (unknown pixels count as solid); or an MJCF scene ``.xml``, which is cut into cells.
-            Cells smaller than 0.1 m are joined.
+            of mode trinary or scale (unknown pixels count as solid); or an MJCF scene ``.xml``,
+            which is cut into cells. Cells smaller than 0.1 m are joined.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -176,7 +175,8 @@ def _read_npz(path: Path) -> Grid:
     if "occupied" not in arrays:
         raise ValueError(f"it has no array 'occupied', only: {', '.join(arrays)}")
     origin = tuple(np.ravel(arrays.get("origin_m", np.zeros(3))).tolist())
-    return make_grid(arrays["occupied"], float(arrays.get("resolution_m", RESOLUTION)), origin)
+    resolution = float(arrays.get("resolution_m", RESOLUTION))
+    return Grid(occupied=arrays["occupied"], resolution=resolution, origin=origin)
 
 
 def _read_ros(path: Path) -> Grid:
@@ -185,19 +185,26 @@ def _read_ros(path: Path) -> Grid:
         about = yaml.safe_load(path.read_text())
         resolution, origin = float(about["resolution"]), [float(v) for v in about["origin"]]
         occupied_from = float(about.get("occupied_thresh", 0.65))
-        free_below = float(about.get("free_thresh", 0.196))
-        image = Image.open(path.parent / about["image"]).convert("L")
+        free_below = min(float(about.get("free_thresh", _UNKNOWN)), _UNKNOWN)
+        image = Image.open(path.parent / about["image"])
+        grey = np.asarray(image.convert("L"), float) / 255
     except (KeyError, TypeError, ValueError, yaml.YAMLError, UnidentifiedImageError) as error:
         raise ValueError(
             f"it is not a map_server file with image, resolution and origin: {error!r}"
         ) from error
     if len(origin) > 2 and origin[2]:
         raise ValueError(f"it is turned by {origin[2]} rad; rotate the image and set yaw to 0")
-    grey = np.asarray(image, float) / 255
+    mode = about.get("mode", "trinary")
+    if mode not in ("trinary", "scale"):
+        raise ValueError(f"its mode is '{mode}'; expected 'trinary': save the map as trinary")
+    if image.mode.startswith(("I", "F")):
+        raise ValueError(
+            f"its image has pixels of kind '{image.mode}'; expected 8 bits a pixel: convert it"
+        )
     if not about.get("negate", 0):
         grey = 1 - grey
     solid = ~(grey < free_below) | (grey > occupied_from)  # unknown is solid
-    return make_grid(solid[::-1].T, resolution, (origin[0], origin[1], 0.0))
+    return Grid(occupied=solid[::-1].T, resolution=resolution, origin=(origin[0], origin[1], 0.0))
 
 
 def _read_mjcf(path: Path) -> Grid:
@@ -237,7 +244,7 @@ def _read_mjcf(path: Path) -> Grid:
             data.geom_xpos[probe] = (first + cell + 0.5) * RESOLUTION
             if mujoco.mj_geomDistance(model, data, probe, geom, RESOLUTION, None) <= 0:
                 occupied[tuple(cell)] = True
-    return make_grid(occupied, RESOLUTION, tuple((first * RESOLUTION).tolist()))
+    return Grid(occupied=occupied, origin=tuple((first * RESOLUTION).tolist()))
 
 
 def _bounds(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[np.ndarray, np.ndarray]:

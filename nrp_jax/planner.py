@@ -119,7 +119,7 @@ def plan(
         straight_rate: share of expansions that go straight, for methods with a sampler.
         max_expansions: budget.
         capacity: most nodes of the tree.
-        lanes: expansions at a time.
+        lanes: expansions at a time; "rrt-connect" takes two at least.
         time_limit_s: wall time of the search [s].
         scene: the exact scene of this robot and grid, to save building it again.
         on_progress: called with the search state and the seconds so far.
@@ -127,6 +127,22 @@ def plan(
     Raises:
         ValueError: an input makes no sense; the message says what to do.
     """
+    if method not in METHODS:
+        raise ValueError(f"unknown method '{method}'; have: {', '.join(METHODS)}")
+    if not (0 <= goal_bias <= 1 and 0 <= straight_rate <= 1):
+        raise ValueError(
+            f"goal_bias is {goal_bias}, straight_rate {straight_rate}; expected shares in [0, 1]"
+        )
+    if lanes < 1 or max_expansions < 1:
+        raise ValueError(
+            f"lanes is {lanes}, max_expansions {max_expansions}; expected 1 or more of both"
+        )
+    lanes = max(lanes, 2) if method == "rrt-connect" else lanes
+    if capacity < lanes + 2:
+        raise ValueError(
+            f"capacity is {capacity}; expected at least {lanes + 2}, two more than the lanes: "
+            "raise it or lower lanes"
+        )
     world = build_world(robot, grid) if world is None else world
     start = check_configuration(robot, world, q_start, "start")
     goal = check_configuration(robot, world, q_goal, "goal")
@@ -231,16 +247,8 @@ def _setup(
     capacity: int,
 ) -> tuple[Any, Tree]:
     """The policy of a method, and the tree it starts from."""
-    if method not in METHODS:
-        raise ValueError(f"unknown method '{method}'; have: {', '.join(METHODS)}")
-    if not (0 <= make["goal_bias"] <= 1 and 0 <= make["straight_rate"] <= 1):
-        raise ValueError(f"goal_bias and straight_rate are shares in [0, 1], but got {make}")
-    if make["lanes"] < 1 or capacity < 2:
-        raise ValueError(
-            f"got lanes={make['lanes']}, capacity={capacity}; expected 1 and 2 or more"
-        )
     if method == "rrt-connect":
-        policy = RRTConnect(lanes=max(make["lanes"], 2))
+        policy = RRTConnect(lanes=make["lanes"])
         return policy, policy.forest(start, goal, capacity)
     common = {
         "goal": goal,

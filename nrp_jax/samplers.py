@@ -271,6 +271,12 @@ def check_fits(sampler: Any, robot: MobileRobot, world: GridWorld, kind: str) ->
             f"the map has {layers} layers of cells of {cell:g} m; samplers have seen {expected} of "
             f"{RESOLUTION} m: see nrp_jax.grid.coarsened and Grid.crop"
         )
+    bottom = float(world.field.origin[2])
+    if not robot.planar and abs(bottom) > RESOLUTION / 2:
+        raise ValueError(
+            f"the map's layers begin at z = {bottom:g} m; samplers have seen maps from 0 m up: cut "
+            "or add layers at the bottom"
+        )
 
 
 @jax.jit

@@ -194,7 +194,8 @@ def _roadmap(
     """A home's roadmap, from the cache if it is there."""
     if cache is None:
         return build_roadmap(world, robot, jax.random.key(seed), nodes)
-    which = hashlib.sha256(np.packbits(grid.occupied).tobytes()).hexdigest()[:12]
+    content = np.packbits(grid.occupied).tobytes() + str(grid.origin).encode()
+    which = hashlib.sha256(content).hexdigest()[:12]
     file = cache / f"roadmap_v{VERSION}_{robot.name}_{which}_{seed}_{nodes}.npz"
     if not file.exists():
         roadmap = build_roadmap(world, robot, jax.random.key(seed), nodes)
@@ -251,7 +252,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
             f"the data set is of task '{dataset.settings.task}'; expected '{task}': give another "
             "--data, or the other --task"
         )
-    maps = {} if arguments.maps is None else _maps(Path(arguments.maps), robot)
+    maps = {} if arguments.maps is None else _maps(Path(arguments.maps), robot, tested)
     settings = {
         "queries": arguments.queries,
         "nodes": arguments.nodes,
@@ -276,18 +277,23 @@ def _run_command(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _maps(folder: Path, robot: MobileRobot) -> dict[str, Grid]:
-    """The maps in a folder that the robot can use, by name."""
-    files = sorted(file for file in folder.rglob("*") if file.suffix in (".npz", ".yaml", ".xml"))
+def _maps(
+    folder: Path, robot: MobileRobot, tested: Mapping[str, samplers.Sampler]
+) -> dict[str, Grid]:
+    """The maps in a folder that robot and samplers can use, by path, with x and y from 0."""
+    kinds = (".npz", ".yaml", ".yml", ".xml")
     grids = {}
-    for file in files:
+    for file in sorted(file for file in folder.rglob("*") if file.suffix in kinds):
         grid = load_map(file)
-        if grid.planar and not robot.planar:
-            print(f"map '{file}' is planar: not for {robot.name}", file=sys.stderr)
+        grid = dataclasses.replace(grid, origin=(0.0, 0.0, grid.origin[2]))
+        try:
+            world = build_world(robot, grid)
+            for kind, sampler in tested.items():
+                samplers.check_fits(sampler, robot, world, kind)
+        except ValueError as error:
+            print(f"map '{file}' is left out: {error}", file=sys.stderr)
             continue
-        grids[file.stem] = dataclasses.replace(grid, origin=(0.0, 0.0, 0.0))
+        grids[file.relative_to(folder).as_posix()] = grid
     if not grids:
-        raise ValueError(
-            f"no maps for {robot.name} in '{folder}'; expected .npz, .yaml or .xml files"
-        )
+        raise ValueError(f"no maps for {robot.name} in '{folder}'; expected {', '.join(kinds)}")
     return grids

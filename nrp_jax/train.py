@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import functools
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -66,6 +67,7 @@ def train(
     Raises:
         ValueError: ``out`` holds a training of another model, data or settings, or there are too
             few homes to hold some out.
+        RuntimeError: the validation loss is not finite any more.
     """
     parts = {"model": dataclasses.asdict(config), "settings": dataclasses.asdict(settings)}
     out = claim(Path(out), {**parts, "data": stamp})
@@ -131,6 +133,12 @@ def train(
             state, loss = update(state, examples, jnp.asarray(chosen))
             losses.append(loss)
         figures = validate(config, module, robot, state.variables, examples, validation)
+        if not np.isfinite(figures["loss"]):
+            keeper.close()
+            raise RuntimeError(
+                f"training diverged in epoch {epoch}: the best epoch before is kept in '{out}'; "
+                "lower --learning-rate and choose another folder with --out"
+            )
         history.append(
             {
                 "epoch": epoch,
@@ -147,8 +155,12 @@ def train(
         write_log(history, out)
         bar.set_postfix_str(f"loss {figures['loss']:.4f}, quality {figures['quality']:.3f}")
     keeper.close()
-    plot_curves(history, out / "curves.png", f"{config.task} {config.kind}")
-    return export()
+    model = export()
+    try:
+        plot_curves(history, out / "curves.png", f"{config.task} {config.kind}")
+    except ModuleNotFoundError:
+        print("no curves: matplotlib is missing; pip install 'vrrt-jax[plot]'", file=sys.stderr)
+    return model
 
 
 def init(config: ModelConfig, module: nn.Module, batch: Batch, key: jax.Array) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nrp_jax.grid import make_grid
+from nrp_jax.grid import Grid
 from nrp_jax.robots import load_robot
 from nrp_jax.world import batch_is_free, build_world
 
@@ -16,7 +16,7 @@ def random_grid(seed: int, size: int = 60, height: int = 1, boxes: int = 14):
         low = rng.integers(0, size, 2)
         high = low + rng.integers(3, 10, 2)
         occupied[low[0] : high[0], low[1] : high[1], : rng.integers(1, height + 1)] = True
-    return make_grid(occupied)
+    return Grid(occupied=occupied)
 
 
 def free(world, q: np.ndarray) -> np.ndarray:

@@ -74,7 +74,7 @@ def test_scores_are_written(folder, tmp_path, capsys):
     command += ["--nodes", "1500", "--json", str(out)]
     assert main([*command, "--task", "snake"]) == 0
     found = json.loads(out.read_text())
-    assert found["checked"] and found["maps"]["names"] == ["home"]
+    assert found["checked"] and found["maps"]["names"] == ["home.npz"]
     for homes in (found["unseen_homes"], found["maps"]):
         for kind in ("discriminator", "cvae"):
             assert 0.5 < homes[kind]["optimality_score"] <= 1.0 and homes[kind]["queries"] == 8

@@ -1,6 +1,7 @@
 """Plans in homes, from start to goal, each verified by C MuJoCo."""
 
 import json
+import types
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +9,12 @@ import numpy as np
 import pytest
 
 import nrp_jax
+from nrp_jax import planner, viz
 from nrp_jax.bench import planning
 from nrp_jax.cli import main
 from nrp_jax.exact import ExactScene, verify
-from nrp_jax.grid import make_grid
 from nrp_jax.planner import Status, plan, trajectory_of
+from vrrt_jax.core.shortcut import shortcut
 from vrrt_jax.core.types import pytree
 
 START = np.array([1.0, 1.0, 0.6, 1.0, -0.8, 1.0, -0.8, 0.9], np.float32)
@@ -30,7 +32,7 @@ def home():
     occupied = np.zeros((50, 40), bool)
     occupied[24:26] = True
     occupied[24:26, 25:35] = False
-    return make_grid(occupied)
+    return nrp_jax.Grid(occupied=occupied)
 
 
 @pytest.fixture(scope="module")
@@ -117,13 +119,26 @@ def test_budget_and_capacity(solve):
     assert solve("rrt-is", capacity=64, goal_bias=0.0).status is Status.TREE_FULL
 
 
+def test_rrt_connect_counts_the_lanes_it_takes(solve, monkeypatch):
+    class Asked(Exception):
+        pass
+
+    def search(world, policy, tree, *, stop, **_):
+        raise Asked(policy.lanes, int(stop.max_iterations))
+
+    monkeypatch.setattr(planner, "search", search)
+    with pytest.raises(Asked) as asked:
+        solve("rrt-connect", lanes=1, max_expansions=64)
+    assert asked.value.args == (2, 32)
+
+
 def test_fetch_drives_and_reaches(snake):
     fetch = nrp_jax.load_robot("fetch")
     occupied = np.zeros((60, 40, 20), bool)
     occupied[28:30, :, :] = True
     occupied[28:30, 20:33, :] = False
     occupied[40:45, 5:10, 6:8] = True  # a table's top
-    grid = make_grid(occupied)
+    grid = nrp_jax.Grid(occupied=occupied)
     start = np.array([1.2, 1.2, 0.5, 0.2, 1.3, 1.4, -0.2, 1.5, 0.0, 1.66, 0.0], np.float32)
     goal = np.array([4.6, 2.4, -1.0, 0.3, 0.5, 0.2, 0.0, 0.8, 0.0, 0.5, 0.0], np.float32)
     result = plan(fetch, grid, start, goal, key=jax.random.key(0), capacity=2048)
@@ -136,6 +151,16 @@ def test_fetch_drives_and_reaches(snake):
     assert sideways.max() < 2e-3
     assert np.all(np.abs(turn) <= np.linalg.norm(step, axis=1) / 0.095 + 2e-3)
     assert np.abs(turn).max() <= 0.0205  # what the arm holds out is not swept past anything
+
+
+def test_the_shortest_drive_has_no_shortcuts():
+    """Parts of a drive that turns are not as long as their share of it."""
+    grid = nrp_jax.Grid(occupied=np.zeros((60, 40, 20)))
+    world = nrp_jax.build_world(nrp_jax.load_robot("fetch"), grid)
+    start = np.array([2, 2, 1.5, 0.2, 1.3, 1.4, -0.2, 1.5, 0.0, 1.66, 0.0], np.float32)
+    goal = np.concatenate([[3, 2.5, -2], start[3:]], dtype=np.float32)
+    path = np.stack([start, world.interpolate(start, goal, 0.5), goal])
+    np.testing.assert_array_equal(shortcut(world, path, key=jax.random.key(0)), path)
 
 
 def test_verification_sees_what_is_wrong(snake, home, scene, solve):
@@ -153,7 +178,7 @@ def test_verification_sees_what_is_wrong(snake, home, scene, solve):
 
 def test_sideways_is_seen():
     fetch = nrp_jax.load_robot("fetch")
-    grid = make_grid(np.zeros((60, 60, 20)))
+    grid = nrp_jax.Grid(occupied=np.zeros((60, 60, 20)))
     slide = np.zeros((5, 11))
     slide[:, :2], slide[:, 3] = 3.0, 0.2
     slide[:, 1] += 0.02 * np.arange(5)
@@ -175,6 +200,8 @@ def test_sideways_is_seen():
             "the sampler is the discriminator of 'snake'; expected the cvae",
         ),
         ({"goal_bias": 2.0}, "shares in"),
+        ({"max_expansions": 0}, "max_expansions 0; expected 1 or more"),
+        ({"capacity": 33}, "capacity is 33; expected at least 34"),
     ],
 )
 def test_bad_input(snake, home, scene, change, message):
@@ -183,7 +210,7 @@ def test_bad_input(snake, home, scene, change, message):
         plan(snake, home, scene=scene, **arguments)
 
 
-def test_command_line(tmp_path, home, capsys):
+def test_command_line(tmp_path, home, capsys, monkeypatch):
     home.save(tmp_path / "home.npz")
     out = tmp_path / "out"
     numbers = [",".join(str(float(v)) for v in q) for q in (START, GOAL)]
@@ -196,6 +223,25 @@ def test_command_line(tmp_path, home, capsys):
     assert (out / "plan.png").stat().st_size > 10_000
     assert main([*command, "--start=1,2"]) == 2
     assert "the start has shape" in capsys.readouterr().err
+
+    def without_matplotlib(*_):
+        raise ModuleNotFoundError("No module named 'matplotlib'")
+
+    monkeypatch.setattr(viz, "save_plan", without_matplotlib)
+    assert main(command) == 0
+    told = capsys.readouterr()
+    assert told.out.startswith("SOLVED") and "vrrt-jax[plot]" in told.err
+
+
+def test_an_interrupted_bench_ends(snake, home, scene, monkeypatch):
+    asked = planning.Home(
+        seed=0, grid=home, world=None, scene=scene, starts=START[None], goals=GOAL[None]
+    )
+    stopped = types.SimpleNamespace(status=Status.INTERRUPTED)
+    monkeypatch.setattr(planning, "plan", lambda *_, **__: stopped)
+    budget = {"max_expansions": 10, "lanes": 10, "goal_bias": 0.1}
+    with pytest.raises(KeyboardInterrupt):
+        planning.run(snake, [asked], "rrt", None, **budget, on_result=pytest.fail)
 
 
 def test_bench_counts_verified_plans(snake, home, scene, tmp_path, monkeypatch, capsys):

@@ -12,6 +12,7 @@ from nrp_jax import samplers, score
 from nrp_jax.checkpoint import Model, build_module, save_model
 from nrp_jax.examples import make_batch, make_examples
 from nrp_jax.expert import build_roadmap
+from nrp_jax.grid import Grid
 from nrp_jax.models import ModelConfig
 from nrp_jax.robots import load_robot
 from nrp_jax.train import init
@@ -98,6 +99,32 @@ def test_weights_of_another_task_or_kind_are_refused(models, tmp_path):
     with pytest.raises(ValueError, match="unknown task 'panda'"):
         samplers.load_sampler("panda", "cvae")
     assert samplers.load_sampler("snake", "cvae", tmp_path, checked=4).checked == 4
+
+
+def test_maps_that_do_not_fit_are_left_out(tmp_path, capsys):
+    for name, layers, z in (
+        ("a/map", 20, 0.02),
+        ("b/map", 20, 0.0),
+        ("flat", 1, 0.0),
+        ("high", 20, 0.1),
+        ("low", 19, 0.0),
+    ):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        grid = Grid(occupied=np.zeros((9, 9, layers)), origin=(3.0, -2.0, z))
+        grid.save(tmp_path / f"{name}.npz")
+    tested = {"cvae": samplers.load_sampler("fetch", "cvae")}
+    maps = score._maps(tmp_path, load_robot("fetch"), tested)
+    assert [*maps] == ["a/map.npz", "b/map.npz"]
+    assert maps["a/map.npz"].origin == (0.0, 0.0, 0.02)
+    told = capsys.readouterr().err.splitlines()
+    assert [line.split("'")[1].split("/")[-1] for line in told] == [
+        "flat.npz",
+        "high.npz",
+        "low.npz",
+    ]
+    assert "samplers have seen 20" in told[2] and "begin at z = 0.1 m" in told[1]
+    with pytest.raises(ValueError, match="no maps for fetch in .*; expected .npz"):
+        score._maps(tmp_path / "none", load_robot("fetch"), tested)
 
 
 def test_scores_of_waypoints(world):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from nrp_synthetic import synthetic_rows
 
+from nrp_jax import train as training
 from nrp_jax.checkpoint import load_model
 from nrp_jax.examples import load_examples, make_batch, make_examples
 from nrp_jax.models import ModelConfig
@@ -57,7 +58,7 @@ def test_homes_are_held_out_whole():
         split_by_home(np.zeros(5), SETTINGS)
 
 
-def test_the_discriminator_learns_and_goes_on_after_a_kill(rows, tmp_path):
+def test_the_discriminator_learns_and_goes_on_after_a_kill(rows, tmp_path, monkeypatch, capsys):
     """It learns what is free in unseen homes; a killed run ends as an unbroken one."""
     config = ModelConfig.default("snake", "discriminator")
     robot, examples = examples_of(config, rows)
@@ -67,6 +68,13 @@ def test_the_discriminator_learns_and_goes_on_after_a_kill(rows, tmp_path):
         log = list(csv.DictReader(handle))
     assert [int(row["epoch"]) for row in log] == list(range(16))
     assert (tmp_path / "a" / "curves.png").stat().st_size > 5000
+
+    def without_matplotlib(*_):
+        raise ModuleNotFoundError("No module named 'matplotlib'")
+
+    monkeypatch.setattr(training, "plot_curves", without_matplotlib)
+    same = train(config, robot, examples, tmp_path / "a", settings=SETTINGS, progress=False)
+    assert same.info["best"] == model.info["best"] and "no curves" in capsys.readouterr().err
 
     # The same in a process of its own, which is killed while it trains.
     process = subprocess.Popen(
@@ -90,6 +98,18 @@ def test_the_discriminator_learns_and_goes_on_after_a_kill(rows, tmp_path):
         np.testing.assert_allclose(a, b, atol=1e-4)
     with pytest.raises(ValueError, match="holds a training of another model"):
         train(config, robot, examples, tmp_path / "a", settings=TrainConfig(), progress=False)
+
+
+def test_a_diverged_training_keeps_the_best_epoch(rows, tmp_path, monkeypatch):
+    config = ModelConfig.default("snake", "discriminator")
+    robot, examples = examples_of(config, rows)
+    losses = iter([0.5, 0.4, np.nan])
+    monkeypatch.setattr(training, "validate", lambda *_: {"loss": next(losses), "quality": 0.5})
+    with pytest.raises(RuntimeError, match="diverged in epoch 2: .* lower --learning-rate"):
+        train(config, robot, examples, tmp_path, settings=SETTINGS, progress=False)
+    assert load_model(tmp_path).info["best"]["epoch"] == 1
+    assert len((tmp_path / "log.csv").read_text().splitlines()) == 3
+    assert not (tmp_path / "checkpoint" / "3").exists()
 
 
 def test_the_generator_learns(rows, tmp_path):

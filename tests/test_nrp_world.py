@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import nrp_jax
+from nrp_jax.bench import checks
 from nrp_jax.bench.checks import SphereLoop
 from nrp_jax.exact import ExactScene, merge_cells
 from nrp_jax.field import make_field, room
-from nrp_jax.grid import coarsened, load_map, make_grid
+from nrp_jax.grid import coarsened, load_map
 from vrrt_jax.core.edges import free_steps
 from vrrt_jax.core.rrt import sample_configurations
 
@@ -76,9 +77,31 @@ def test_no_collision_is_missed(worlds, name):
     assert np.mean(~free & by_mujoco) < (0.04 if name == "snake" else 0.08)
 
 
+def test_planar_boxes_stand_where_the_snake_is():
+    occupied = np.zeros((40, 40), bool)
+    occupied[20:22] = True
+    grid = nrp_jax.Grid(occupied=occupied, origin=(0.0, 0.0, -2.0))
+    scene = ExactScene(nrp_jax.load_robot("snake"), grid)
+    q = np.array([1.0, 1.0, 0.6, 1.0, -0.8, 1.0, -0.8, 0.9])
+    assert scene.touching(q) is None
+    for x in (2.1, 4.1):  # the wall, and what is beside the map
+        q[0] = x
+        assert "touches the map" in (scene.touching(q) or "")
+
+
+def test_rates_of_fewer_configurations_than_a_batch(worlds, monkeypatch):
+    monkeypatch.setattr(checks, "_rate", lambda num, *_: float(num))
+    robot, grid, _ = worlds["snake"]
+    rates = checks.run(robot, grid, num=100)["checks_per_s"]
+    assert rates == {"batched": 100, "sphere_loop": 100, "mujoco": 100}
+    with pytest.raises(ValueError, match="num is 0; expected at least 1"):
+        checks.run(robot, grid, num=0)
+
+
 def test_outside_the_map_all_is_solid(worlds):
     for robot, grid, _ in worlds.values():
-        empty = nrp_jax.build_world(robot, make_grid(np.zeros((40, 40, 20)), origin=grid.origin))
+        clear = nrp_jax.Grid(occupied=np.zeros((40, 40, 20)), origin=grid.origin)
+        empty = nrp_jax.build_world(robot, clear)
         q = np.zeros((5, robot.num_joints), np.float32)
         q[:, 3 if robot.planar else 5] = 1.0 if robot.planar else -1.0
         if not robot.planar:
@@ -90,7 +113,7 @@ def test_outside_the_map_all_is_solid(worlds):
 
 def test_the_floor_stops_the_arm():
     fetch = nrp_jax.load_robot("fetch")
-    world = nrp_jax.build_world(fetch, make_grid(np.zeros((60, 60, 20))))
+    world = nrp_jax.build_world(fetch, nrp_jax.Grid(occupied=np.zeros((60, 60, 20))))
     q = np.zeros((2, 11), np.float32)
     q[:, :2], q[:, 3] = 3.0, 0.1
     q[1, 5] = 1.2  # the straight arm points down
@@ -184,7 +207,7 @@ def test_merged_cells_are_the_cells(rng):
 def test_flatten_crop_and_save(tmp_path):
     occupied = np.zeros((20, 30, 20), bool)
     occupied[3, 4, 15], occupied[5, 6, 2] = True, True
-    grid = make_grid(occupied, origin=(1.0, 2.0, 0.0))
+    grid = nrp_jax.Grid(occupied=occupied, origin=(1.0, 2.0, 0.0))
     assert np.argwhere(grid.flatten().occupied).tolist() == [[5, 6, 0]]
     assert np.argwhere(grid.flatten(1.0, 2.0).occupied).tolist() == [[3, 4, 0]]
     part = grid.crop((1.5, 2.5), (2.0, 3.0))
@@ -196,20 +219,40 @@ def test_flatten_crop_and_save(tmp_path):
     assert again.origin == grid.origin and again.resolution == grid.resolution
 
 
-def test_ros_map(tmp_path):
+ROS = "image: home.pgm\nresolution: 0.05\norigin: [-1.0, -2.0, 0.0]\noccupied_thresh: 0.65\n"
+
+
+@pytest.mark.parametrize(
+    ("free_thresh", "negate", "mode"),
+    [(0.196, 0, "trinary"), (0.25, 0, "trinary"), (0.25, 1, "trinary"), (0.25, 0, "scale")],
+)
+def test_ros_map(tmp_path, free_thresh, negate, mode):
     from PIL import Image
 
     grey = np.full((40, 61), 254, np.uint8)
     grey[10, 20], grey[30, 40] = 0, 205  # solid, unknown
-    Image.fromarray(grey).save(tmp_path / "home.pgm")
+    Image.fromarray(255 - grey if negate else grey).save(tmp_path / "home.pgm")
     (tmp_path / "home.yaml").write_text(
-        "image: home.pgm\nresolution: 0.05\norigin: [-1.0, -2.0, 0.0]\nnegate: 0\n"
-        "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
+        f"{ROS}free_thresh: {free_thresh}\nnegate: {negate}\nmode: {mode}\n"
     )
     grid = load_map(tmp_path / "home.yaml")
     assert grid.occupied.shape == (31, 20, 1) and grid.origin == (-1.0, -2.0, 0.0)
     assert np.argwhere(grid.occupied[:-1, :, 0]).tolist() == [[10, 14], [20, 4]]
     assert grid.occupied[-1].all()  # half of it lies beside the map
+
+
+def test_ros_maps_of_other_kinds_are_refused(tmp_path):
+    from PIL import Image
+
+    path = tmp_path / "home.yaml"
+    Image.fromarray(np.full((4, 4), 254, np.uint8)).save(tmp_path / "home.pgm")
+    path.write_text(f"{ROS}mode: raw\n")
+    with pytest.raises(ValueError, match="mode is 'raw'; expected .* save the map as trinary"):
+        load_map(path)
+    Image.fromarray(np.full((4, 4), 9000, np.uint16)).save(tmp_path / "home.png")
+    path.write_text(ROS.replace("pgm", "png"))
+    with pytest.raises(ValueError, match="expected 8 bits a pixel"):
+        load_map(path)
 
 
 def test_mjcf_scene_in_cells(tmp_path):
@@ -239,7 +282,15 @@ def test_mjcf_scene_in_cells(tmp_path):
 )
 def test_bad_maps(occupied, resolution, message):
     with pytest.raises(ValueError, match=message):
-        make_grid(occupied, resolution)
+        nrp_jax.Grid(occupied=occupied, resolution=resolution)
+
+
+def test_a_grid_from_other_kinds_of_arrays():
+    grid = nrp_jax.Grid(occupied=np.eye(4), origin=(1, 2))  # type: ignore
+    assert grid.occupied.shape == (4, 4, 1) and grid.occupied.dtype == bool
+    assert grid.origin == (1.0, 2.0, 0.0) and grid.planar
+    with pytest.raises(ValueError, match=r"origin is \(1.0,\); expected x, y"):
+        nrp_jax.Grid(occupied=np.eye(4), origin=(1.0,))
 
 
 def test_bad_map_files(tmp_path):
@@ -255,9 +306,10 @@ def test_bad_map_files(tmp_path):
     with pytest.raises(ValueError, match="image, resolution and origin"):
         load_map(tmp_path / "map.yaml")
     with pytest.raises(ValueError, match="cells are 0.3 m"):
-        coarsened(make_grid(np.zeros((3, 3)), 0.3))
+        coarsened(nrp_jax.Grid(occupied=np.zeros((3, 3)), resolution=0.3))
     with pytest.raises(ValueError, match="needs a map with heights"):
-        nrp_jax.build_world(nrp_jax.load_robot("fetch"), make_grid(np.zeros((30, 30))))
+        flat = nrp_jax.Grid(occupied=np.zeros((30, 30)))
+        nrp_jax.build_world(nrp_jax.load_robot("fetch"), flat)
 
 
 @pytest.mark.skipif(not MAPS.is_dir(), reason="NRP_MAPS names no folder")

@@ -125,17 +125,24 @@ def robot_plates_overlap(robot: MobileRobot, poses: np.ndarray) -> bool:
 
 
 def run(robot: MobileRobot, grid: Grid, num: int = 10_000, timed: int = 500) -> dict:
-    """Rates [1/s], and how the three opinions compare on random configurations of a map."""
+    """Rates [1/s], and how the three opinions compare on random configurations of a map.
+
+    Raises:
+        ValueError: there is nothing to compare.
+    """
+    if num < 1:
+        raise ValueError(f"num is {num}; expected at least 1 configuration")
     world = build_world(robot, grid)
     q = np.asarray(sample_configurations(world, jax.random.key(0), num))
     batched = np.concatenate([np.asarray(batch_is_free(world, b)) for b in _batches(q)])
     loop, scene = SphereLoop(robot, grid), ExactScene(robot, grid)
     by_loop = np.array([loop.is_free(row) for row in q])
     by_mujoco = np.array([scene.touching(row) is None for row in q])
+    batch, rows = q[:BATCH], q[:timed]
     rates = {
-        "batched": _rate(BATCH, lambda: batch_is_free(world, q[:BATCH]), 20),
-        "sphere_loop": _rate(timed, lambda: [loop.is_free(row) for row in q[:timed]], 3),
-        "mujoco": _rate(timed, lambda: [scene.touching(row) for row in q[:timed]], 3),
+        "batched": _rate(len(batch), lambda: batch_is_free(world, batch), 20),
+        "sphere_loop": _rate(len(rows), lambda: [loop.is_free(row) for row in rows], 3),
+        "mujoco": _rate(len(rows), lambda: [scene.touching(row) for row in rows], 3),
     }
     return {
         "robot": robot.name,
@@ -156,7 +163,7 @@ def run(robot: MobileRobot, grid: Grid, num: int = 10_000, timed: int = 500) -> 
         "checks_per_s": {k: round(v) for k, v in rates.items()},
         "batched_over_loop": round(rates["batched"] / rates["sphere_loop"], 1),
         "batched_over_mujoco": round(rates["batched"] / rates["mujoco"], 1),
-        "links_us": _links_us(robot, q[:BATCH]),
+        "links_us": _links_us(robot, batch),
     }
 
 

@@ -14,7 +14,7 @@ from nrp_jax.data import Settings, home_seed
 from nrp_jax.difficulty import EXPANSIONS, MIN_GEODESIC, fair_house, long_queries
 from nrp_jax.exact import ExactScene
 from nrp_jax.houses import CELLS
-from nrp_jax.planner import KINDS, METHODS, PlanResult, plan
+from nrp_jax.planner import KINDS, METHODS, PlanResult, Status, plan
 from nrp_jax.robots import MobileRobot, load_robot
 from nrp_jax.world import GridWorld, build_world
 from vrrt_jax.core.timing import machine
@@ -61,27 +61,31 @@ def run(
     Returns:
         ``n``, ``success`` (share), ``median_search_s``, ``median_expansions`` and ``mean_cost_m``
         (of those solved), ``not_verified`` (paths that C MuJoCo refuses).
+
+    Raises:
+        KeyboardInterrupt: a search was interrupted.
     """
     results = []
     for home in homes:
         for index, (start, goal) in enumerate(zip(home.starts, home.goals, strict=True)):
-            results.append(
-                plan(
-                    robot,
-                    home.grid,
-                    start,
-                    goal,
-                    key=jax.random.key(home.seed + index),
-                    method=method,
-                    sampler=sampler,
-                    world=home.world,
-                    scene=home.scene,
-                    goal_bias=goal_bias,
-                    max_expansions=max_expansions,
-                    lanes=lanes,
-                )
+            result = plan(
+                robot,
+                home.grid,
+                start,
+                goal,
+                key=jax.random.key(home.seed + index),
+                method=method,
+                sampler=sampler,
+                world=home.world,
+                scene=home.scene,
+                goal_bias=goal_bias,
+                max_expansions=max_expansions,
+                lanes=lanes,
             )
-            on_result(results[-1])
+            if result.status is Status.INTERRUPTED:
+                raise KeyboardInterrupt
+            results.append(result)
+            on_result(result)
     solved = [result for result in results if result.ok]
     return {
         "n": len(results),
@@ -89,7 +93,7 @@ def run(
         "median_search_s": round(float(np.median([r.timing["search_s"] for r in results])), 4),
         "median_expansions": float(np.median([r.expansions for r in solved])) if solved else None,
         "mean_cost_m": round(float(np.mean([r.cost for r in solved])), 3) if solved else None,
-        "not_verified": sum(r.status.name == "NOT_VERIFIED" for r in results),
+        "not_verified": sum(r.status is Status.NOT_VERIFIED for r in results),
     }
 
 

@@ -67,11 +67,12 @@ def _round(world: Space, path: _Path, key: jax.Array) -> _Path:
     ends = jnp.sort(ends.at[0].set(jnp.stack([0.0 * along[-1], along[-1]])), axis=1)
     index = jnp.clip(jnp.searchsorted(along, ends, side="right") - 1, 0, path.size - 2)
     share = jnp.clip((ends - along[index]) / jnp.maximum(length[index], 1e-9), 0.0, 1.0)
-    q_ends = world.end(path.q[index], world.part(_rows(edges, index), share))
+    parts = world.part(_rows(edges, index), share)
+    q_ends, at = world.end(path.q[index], parts), along[index] + world.length(parts)
     q_a, q_b = q_ends[:, 0], q_ends[:, 1]
 
     direct = world.edge(q_a, q_b)
-    saving = ends[:, 1] - ends[:, 0] - world.length(direct)
+    saving = at[:, 1] - at[:, 0] - world.length(direct)
     tried = (saving > GAIN) & world.checkable(direct, EDGE_STEPS)
     direct = world.part(direct, tried.astype(q_a.dtype))
     coarse = free_along(world, q_a, direct, COARSE_STEPS) == COARSE_STEPS
