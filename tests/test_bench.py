@@ -13,6 +13,7 @@ import vrrt_jax
 from vrrt_jax import baselines
 from vrrt_jax.bench import methods, protocol, runner, tables, tasks, twins, worlds
 from vrrt_jax.cli import main
+from vrrt_jax.core.edges import joint_error
 from vrrt_jax.core.obstacles import load_obstacles
 from vrrt_jax.core.verify import contacts
 from vrrt_jax.core.world import obstacle_list
@@ -54,7 +55,7 @@ def test_tasks_are_free_at_the_right_distance_and_repeat(robot):
         other = tasks.make_task(robot, level, 1, 8, obstacles=True)
         assert not np.array_equal(task.q_goal, other.q_goal)
         world = tasks.bench_world(robot, task.world)
-        error = tasks.joint_error(world, task.q_start, task.q_goal)
+        error = joint_error(world, task.q_start, task.q_goal)
         assert np.linalg.norm(error) == pytest.approx(level, abs=1e-3)
         for q in (task.q_start, task.q_goal):
             assert not contacts(tasks.bench_robot(robot), obstacle_list(world), q)

@@ -143,6 +143,30 @@ def test_wrapping_joint_takes_the_short_way(pendulum):
     assert verify_path(pendulum, [ahead], path + 2 * np.pi).ok
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('pos="0.25 0 0"', 'pos="0.25 0 0" contype="1" conaffinity="0"'),
+        ("<mujoco>", '<mujoco><option><flag contact="disable" constraint="disable"/></option>'),
+    ],
+)
+def test_no_setting_of_a_file_hides_a_contact(tmp_path, old, new):
+    (tmp_path / "arm.xml").write_text(PENDULUM.replace(old, new))
+    robot = load_robot(tmp_path / "arm.xml")
+    post = Obstacle(name="post", kind="box", position=(0, 0.4, 1), size=(0.05, 0.05, 0.2))
+    for kind in GEOMETRIES:
+        result = verify_path(robot, [post], np.array([[0.0], [3.0]]), geometry=kind)
+        assert not result.ok and "post" in str(result.contact), kind
+
+
+def test_a_robot_whose_file_has_moved_is_checked_by_its_spheres(tmp_path):
+    (tmp_path / "arm.xml").write_text(PENDULUM)
+    robot = load_robot(tmp_path / "arm.xml")
+    (tmp_path / "arm.xml").unlink()
+    result = verify_path(robot, [FAR], np.array([[0.1], [0.2]]))
+    assert result.ok and result.geometry == "spheres"
+
+
 def test_files_own_geometry_is_the_truth(pendulum):
     """A box arm: the corner of its covering spheres touches where the box does not."""
     close = Obstacle(name="close", kind="sphere", position=(0.25, 0.0, 1.03), size=(0.009, 0, 0))

@@ -424,6 +424,23 @@ def test_several_views_and_masks(panda, self_model, camera, image, open_world):
     assert at_goal < 0.1 * at_start
 
 
+TURNTABLE = """<mujoco><worldbody><body name="arm"><joint name="turn" axis="0 0 1" limited="false"/>
+<geom type="sphere" size="0.05" pos="0.3 0 0"/></body></worldbody></mujoco>"""
+
+
+def test_paths_go_on_where_a_joint_wraps(tmp_path, panda):
+    (tmp_path / "turntable.xml").write_text(TURNTABLE)
+    robot = vrrt_jax.load_robot(tmp_path / "turntable.xml")
+    world = vrrt_jax.build_world(robot, [])
+    q_start, q_goal = np.array([3.0 + 2 * np.pi]), np.array([-3.0])
+    result = vrrt_jax.plan_to_configuration(robot, world, q_start, q_goal, key=jax.random.key(0))
+    assert result.ok
+    assert result.path[0] == pytest.approx(3.0, abs=1e-5)
+    assert result.path[-1] == pytest.approx(2 * np.pi - 3.0, abs=1e-5)
+    with pytest.raises(ValueError, match="the world is of a robot with joints turn; this one"):
+        vrrt_jax.plan_to_configuration(panda, world, Q_START, Q_GOAL, key=jax.random.key(0))
+
+
 def test_joint_goals(panda, wall_world):
     goal = Q_START * np.array([-1, 1, 1, 1, 1, 1, 1], np.float32)
     result = vrrt_jax.plan_to_configuration(panda, wall_world, Q_START, goal, key=jax.random.key(0))

@@ -53,7 +53,7 @@ RANGES = {
     "start_preference": (0.0, np.inf),
     "probe_alpha": (0.0, 1.0),
     "probe_steps": (0, 100_000),
-    "lanes": (1, 4096),
+    "lanes": (2, 4096),
     "image_px": (8, 4096),
 }
 
@@ -62,7 +62,9 @@ def check_config(config: Any) -> None:
     """Raise a ValueError that names the setting out of range."""
     for name, (low, high) in RANGES.items():
         value = getattr(config, name)
-        if value is not None and not low <= value <= high:
+        if value is None and name == "patience":
+            continue
+        if value is None or not low <= value <= high:
             raise ValueError(f"{name}={value} is out of range; expected {low} to {high}")
     for name in ("kappa", "beta1", "beta2"):
         if not 0.0 <= getattr(config, name) < 1.0:
@@ -96,7 +98,9 @@ def check_limits(robot: Robot, q: Any, what: str) -> np.ndarray:
                 f"the {what} is outside the limits: joint '{name}' is at {value:.4f}, its bounds "
                 f"are [{low:.4f}, {high:.4f}]"
             )
-    return np.where(robot.wraps, q, np.clip(q, robot.lower, robot.upper)).astype(np.float32)
+    turns = np.where(robot.wraps & (np.abs(q) > np.pi), np.floor((q + np.pi) / (2 * np.pi)), 0.0)
+    inside = np.where(robot.wraps, q - 2 * np.pi * turns, np.clip(q, robot.lower, robot.upper))
+    return inside.astype(np.float32)
 
 
 def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.ndarray:
@@ -105,6 +109,11 @@ def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.n
     Raises:
         ValueError: names the joint, its value and its bounds, or the bodies that touch.
     """
+    if tuple(world.joint_names) != robot.joint_names:
+        raise ValueError(
+            f"the world is of a robot with joints {', '.join(world.joint_names)}; this one, "
+            f"'{robot.name}', has {', '.join(robot.joint_names)}: build the world for it"
+        )
     q = check_limits(robot, q, what)
     if not bool(_is_free(world, jnp.asarray(q))):
         obstacles = obstacle_list(world)
@@ -120,7 +129,7 @@ def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.n
 
 def check_self_model(robot: Robot, self_model: SelfModel) -> None:
     """Raise a ValueError if the self-model was trained for another robot."""
-    if self_model.robot != robot.name or len(self_model.joint_names) != len(robot.joint_names):
+    if self_model.robot != robot.name or self_model.joint_names != robot.joint_names:
         raise ValueError(
             f"the self-model is of '{self_model.robot}' with joints "
             f"{', '.join(self_model.joint_names)}; this robot is '{robot.name}' with joints "

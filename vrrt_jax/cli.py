@@ -97,7 +97,8 @@ def _parser() -> argparse.ArgumentParser:
 def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
     parser.set_defaults(run=_protocol)
     parser.add_argument("--robot", required=True, help="panda, ur5e or fetch")
-    parser.add_argument("--levels", default="0.5,1.0,1.5,2.0,2.5", help="distances [rad]")
+    levels = "0.5,1.0,1.5,2.0,2.5"
+    parser.add_argument("--levels", type=_numbers, default=levels, help="distances [rad]")
     parser.add_argument("--tasks-per-level", type=int, default=20, help="tasks at each distance")
     parser.add_argument("--seed", type=int, default=0, help="of tasks and plans")
     if what == "ablation":
@@ -332,7 +333,7 @@ def _protocol(arguments: argparse.Namespace) -> int:
     benchmark = protocol.benchmark(
         arguments.what,
         arguments.robot,
-        levels=[float(level) for level in _numbers(arguments.levels)],
+        levels=arguments.levels.tolist(),
         tasks_per_level=arguments.tasks_per_level,
         seed=arguments.seed,
         time_limit_s=arguments.time_limit,

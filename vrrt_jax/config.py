@@ -85,7 +85,9 @@ class PlanResult:
     """What became of a problem."""
 
     status: Status
-    path: np.ndarray  # (P, D) the shortened, verified path; of a failure, the best attempt
+    # (P, D) the shortened, verified path; of a failure, the best attempt; joints without limits may
+    # leave [-pi, pi), so that waypoints can be interpolated
+    path: np.ndarray
     raw_path: np.ndarray  # (P', D) as the tree has it
     target: np.ndarray  # (D,) what was planned to: the end of the path, unless there is none
     alternatives: np.ndarray  # (A, D) other configurations that match the image as well

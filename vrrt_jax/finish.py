@@ -27,6 +27,7 @@ STATUS_OF = {
     Stopped.TIME_LIMIT: Status.TIME_LIMIT,
     Stopped.INTERRUPTED: Status.INTERRUPTED,
 }
+HURRIED = (Stopped.TIME_LIMIT, Stopped.INTERRUPTED)  # what ends these, ends all
 TRIED = 3  # matched configurations that are tried before there is no path
 REFUSED = 3  # paths that the exact check may refuse before it has the last word
 WARY = 0.01  # [m] by which each of them keeps farther away than the one before
@@ -58,7 +59,7 @@ def finish_visual(
     """
     score, q = np.asarray(found.tree.score), np.asarray(found.tree.q)
     search_goal_loss = goal_loss
-    hurried = found.stopped in (Stopped.TIME_LIMIT, Stopped.INTERRUPTED)
+    hurried = found.stopped in HURRIED
     if polishing is not None and not hurried:
         goal_loss = polishing.goal_loss
         nodes = list(_distinct(world, score, q, q_start, config.hypotheses, np.inf))
@@ -78,21 +79,22 @@ def finish_visual(
         path = paths.get(end)
         if path is None:
             found, path = _connected(world, found, q_start, q[end], key, config)
-        if path is not None:
+        if path is not None or found.stopped in HURRIED:
             break
-    else:
-        end, path = ends[0], None
+    if path is None:
+        end = ends[0]
     target, loss = q[end], float(score[end])
     matching = [k for k in rivals if score[k] <= goal_loss]
     alike = [k for k in matching if k != end and cost[k] <= ALIKE * cost[end]]
     result = finish(robot, world, found, path, target, loss, goal_loss, key, config, q_start)
     for again in range(1, REFUSED):
-        if hurried or result.status is not Status.NOT_VERIFIED:
+        if result.status is not Status.NOT_VERIFIED:
             break
         key = jax.random.fold_in(key, again)
         idle = dataclasses.replace(found, compile_s=0.0, search_s=0.0)
+        rest = time_left(config, result.timing["search_s"])
         wary = with_margin(world, again * WARY)
-        other, path = _connected(wary, idle, q_start, target, key, config)
+        other, path = _connected(wary, idle, q_start, target, key, rest)
         other = finish(robot, wary, other, path, target, loss, goal_loss, key, config, q_start)
         result = with_time_of(other if other.ok else result, result, other)
     return dataclasses.replace(result, alternatives=q[alike], search_goal_loss=search_goal_loss)
@@ -126,13 +128,18 @@ def _connected(
     key: jax.Array,
     config: PlannerConfig,
 ) -> tuple[SearchResult, np.ndarray | None]:
-    """A path (P, D) by RRT-Connect, if there is one; its time is added to the search's."""
+    """A path (P, D) by RRT-Connect, if there is one; its time is added to the search's.
+
+    If time is up meanwhile, or the user interrupts, the search has stopped for that.
+    """
     policy = RRTConnect(lanes=config.lanes)
     tree = policy.forest(jnp.asarray(q_start), jnp.asarray(q_goal), config.capacity)
     stop = make_stop(0.0, max_iterations=config.connect_iterations)
-    connection = search(world, policy, tree, key=key, stop=stop, time_limit_s=config.time_limit_s)
+    limit_s = time_left(config, found.search_s).time_limit_s
+    connection = search(world, policy, tree, key=key, stop=stop, time_limit_s=limit_s)
     found = dataclasses.replace(
         found,
+        stopped=connection.stopped if connection.stopped in HURRIED else found.stopped,
         compile_s=found.compile_s + connection.compile_s,
         search_s=found.search_s + connection.search_s,
     )
@@ -148,6 +155,11 @@ def _polished(
     compile_s, search_s = found.compile_s + compile_s, found.search_s + polish_s
     found = dataclasses.replace(found, compile_s=compile_s, search_s=search_s)
     return found, result
+
+
+def time_left(config: PlannerConfig, spent_s: float) -> PlannerConfig:
+    """The same settings, with what is left of the time."""
+    return dataclasses.replace(config, time_limit_s=max(0.0, config.time_limit_s - spent_s))
 
 
 def with_time_of(result: PlanResult, *results: PlanResult) -> PlanResult:
@@ -191,13 +203,13 @@ def finish(
 
     Without a path the result is the start alone.
     """
-    has_path = raw_path is not None
+    has_path, hurried = raw_path is not None, found.stopped in HURRIED
     raw_path = q_start[None] if raw_path is None else raw_path
     started = time.perf_counter()
     shortcut(world, raw_path, key=key, rounds=0)
     shortcut_compile_s = time.perf_counter() - started
     started = time.perf_counter()
-    path = shortcut(world, raw_path, key=key, rounds=config.shortcut_rounds)
+    path = np.array(shortcut(world, raw_path, key=key, rounds=config.shortcut_rounds))
     shortcut_s = time.perf_counter() - started
 
     started = time.perf_counter()
@@ -206,15 +218,21 @@ def finish(
     if not verification.ok:
         raw = verify_path(robot, obstacles, raw_path, step=config.verify_step)
         if raw.ok:
-            path, verification = raw_path, raw
+            path, verification = np.array(raw_path), raw
     verify_s = time.perf_counter() - started
 
-    if not has_path:
+    if has_path and loss <= goal_loss and verification.ok:
+        status = Status.SOLVED
+    elif hurried:
+        status = STATUS_OF[found.stopped]
+    elif not has_path:
         status = Status.NO_PATH
     elif loss > goal_loss:
         status = STATUS_OF.get(found.stopped, Status.NO_MATCH)
     else:
-        status = Status.SOLVED if verification.ok else Status.NOT_VERIFIED
+        status = Status.NOT_VERIFIED
+    # Joints that wrap go on from waypoint to waypoint, so that a controller may interpolate.
+    path[:, robot.wraps] = np.unwrap(path[:, robot.wraps], axis=0)
     rejected = np.asarray(found.tree.rejected)
     return PlanResult(
         status=status,

@@ -12,10 +12,10 @@ from vrrt_jax import checks
 from vrrt_jax.config import PlannerConfig, PlanResult
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.rrt import RRT, RRTConnect, connection_path, tree_path
-from vrrt_jax.core.search import make_stop, search
+from vrrt_jax.core.search import interruptible, make_stop, search
 from vrrt_jax.core.types import Status, Tree
 from vrrt_jax.core.world import World
-from vrrt_jax.finish import finish, finish_visual, timed, with_time_of
+from vrrt_jax.finish import STATUS_OF, finish, finish_visual, time_left, timed, with_time_of
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.sight import Setup, Sight, visual_setup, visual_stop
 from vrrt_jax.splat.model import SelfModel
@@ -70,17 +70,18 @@ def plan(
     roots = q_start[None]
     if q_guess is not None:
         roots = np.stack([q_start, checks.check_limits(robot, q_guess, "guess")])
-    result = _attempt(robot, world, setup, roots, key, config, on_progress)
-    for again in range(1, config.attempts):
-        left_s = config.time_limit_s - result.timing["search_s"]
-        if result.status not in AGAIN or left_s <= 0:
-            break
-        key = jax.random.fold_in(key, PLANTING - again)
-        longer = PERSISTENCE * config.connect_iterations
-        rest = dataclasses.replace(config, time_limit_s=left_s, connect_iterations=longer)
-        other = _attempt(robot, world, setup, roots, key, rest, on_progress)
-        best = min(result, other, key=lambda r: (not r.ok, r.loss))
-        result = with_time_of(best, result, other)
+    with interruptible():
+        result = _attempt(robot, world, setup, roots, key, config, on_progress)
+        for again in range(1, config.attempts):
+            rest = time_left(config, result.timing["search_s"])
+            if result.status not in AGAIN or rest.time_limit_s == 0:
+                break
+            key = jax.random.fold_in(key, PLANTING - again)
+            longer = PERSISTENCE * config.connect_iterations
+            rest = dataclasses.replace(rest, connect_iterations=longer)
+            other = _attempt(robot, world, setup, roots, key, rest, on_progress)
+            best = min(result, other, key=lambda r: (not r.ok, r.loss))
+            result = with_time_of(best, result, other)
     return result
 
 
@@ -101,7 +102,7 @@ def _attempt(
         tree,
         key=key,
         stop=visual_stop(config, setup.goal_loss),
-        time_limit_s=config.time_limit_s,
+        time_limit_s=time_left(config, plant_s).time_limit_s,
         on_progress=on_progress,
     )
     found = dataclasses.replace(
@@ -192,6 +193,7 @@ def plan_batch(
         own = dataclasses.replace(
             found,
             tree=own_tree,
+            stopped=found.stopped_each[i],
             compile_s=found.compile_s + sum(compile_s),
             search_s=found.search_s + sum(plant_s),
         )
@@ -263,7 +265,10 @@ def plan_to_configuration(
     path = connection_path(found.tree) if planner == "rrt-connect" else tree_path(found.tree)
     loss = float(jnp.min(found.tree.score))
     goal_loss = max(stop_score, 1e-4)
-    return finish(robot, world, found, path, q_goal, loss, goal_loss, key, config, q_start)
+    result = finish(robot, world, found, path, q_goal, loss, goal_loss, key, config, q_start)
+    if path is None:
+        result = dataclasses.replace(result, status=STATUS_OF[found.stopped])
+    return result
 
 
 def _stack(items: Sequence[Any]) -> Any:

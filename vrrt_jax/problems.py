@@ -10,7 +10,7 @@ import numpy as np
 
 from vrrt_jax.core.obstacles import load_obstacles
 from vrrt_jax.core.world import World, build_world
-from vrrt_jax.robots import Robot, load_robot, scenes_dir
+from vrrt_jax.robots import Robot, load_robot, robot_names, scenes_dir
 from vrrt_jax.splat.camera import camera_from_matrix, look_at
 from vrrt_jax.splat.goal import read_image
 from vrrt_jax.splat.model import SelfModel, load_self_model
@@ -54,7 +54,9 @@ def load_problem(name_or_path: str | Path) -> Problem:
         )
     fields = read_json(file)
     try:
-        robot = load_robot(fields["robot"])
+        robot = load_robot(_beside(folder, fields["robot"]))
+        self_model = fields.get("self_model")
+        self_model = None if self_model is None else _beside(folder, self_model)
         views = fields["views"]
         images = tuple(read_image(folder / view["image"]) for view in views)
         cameras = tuple(
@@ -65,7 +67,7 @@ def load_problem(name_or_path: str | Path) -> Problem:
             name=folder.resolve().name,
             robot=robot,
             world=load_world(folder / fields["world"], robot),
-            self_model=load_self_model(self_model_path(robot, fields.get("self_model"))),
+            self_model=load_self_model(self_model_path(robot, self_model)),
             cameras=cameras,
             goal_images=images,
             q_start=_vector(fields["start"], "start"),
@@ -100,9 +102,18 @@ def load_world(name_or_path: str | Path, robot: Robot, **settings: Any) -> World
 
 
 def self_model_path(robot: Robot, given: str | Path | None = None) -> Path:
-    """Where a robot's self-model is: the given file, or the packaged one."""
+    """Where a robot's self-model is: the given file, or the packaged one.
+
+    Raises:
+        ValueError: none is given, and the robot is not a packaged one.
+    """
     if given is not None:
         return Path(given)
+    if robot.mesh_source not in robot_names():
+        raise ValueError(
+            f"the robot '{robot.name}' comes without a self-model; give --self-model, or train one "
+            "with: vrrt fit"
+        )
     return scenes_dir() / "robots" / robot.name / "self_model.npz"
 
 
@@ -155,6 +166,11 @@ def read_json(path: str | Path) -> Any:
         raise FileNotFoundError(f"cannot read '{path}': {error.strerror}") from None
     except ValueError as error:
         raise ValueError(f"'{path}' is not valid JSON: {error}") from None
+
+
+def _beside(folder: Path, name: str) -> str:
+    """A file of a problem's folder, if it is there; otherwise the name as it is."""
+    return str(folder / name) if (folder / name).is_file() else name
 
 
 def _vector(values: Sequence[float], what: str) -> np.ndarray:

@@ -12,6 +12,8 @@ import numpy as np
 
 import vrrt_jax
 from vrrt_jax.config import PlannerConfig, PlanResult
+from vrrt_jax.core.edges import joint_error
+from vrrt_jax.core.shortcut import path_length
 from vrrt_jax.problems import Problem
 
 
@@ -32,8 +34,9 @@ def summary(
         "loss": result.loss,
         "goal_loss": result.goal_loss,
         "cost": result.cost,
-        "raw_cost": float(np.linalg.norm(np.diff(result.raw_path, axis=0), axis=1).sum()),
-        "q_goal": [round(float(v), 6) for v in result.q_goal],
+        "raw_cost": path_length(problem.world, result.raw_path),
+        "q_goal": np.round(result.q_goal.astype(float), 6).tolist(),
+        "target": np.round(result.target.astype(float), 6).tolist(),
         "alternatives": np.round(result.alternatives, 6).tolist(),
         "timing": {name: round(value, 4) for name, value in result.timing.items()},
         "counts": {
@@ -47,7 +50,7 @@ def summary(
         "versions": versions(),
     }
     if problem.true_goal is not None:
-        error = np.abs(result.q_goal - problem.true_goal)
+        error = joint_error(problem.world, result.target, problem.true_goal)
         fields["error_rad"] = {"mean": float(error.mean()), "max": float(error.max())}
     return fields
 

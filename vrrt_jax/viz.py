@@ -184,7 +184,8 @@ def save_figure(problem: Problem, result: PlanResult, path: str | Path) -> None:
     names = problem.robot.joint_names
     spread = np.ptp(result.path, axis=0)
     order = np.argsort(-spread, kind="stable")
-    planes = [(order[0], order[1]), (order[2 % len(order)], order[3 % len(order)])]
+    a, b, c, d = np.resize(order, 4)
+    planes = [(a, b), (c, d)]
     for column, (a, b) in enumerate(planes):
         _draw_tree(figure.add_subplot(grid[1, 2 + column]), result, (int(a), int(b)), names)
     verdict = result.status.name

@@ -1,6 +1,7 @@
 """The benchmarks by name: the paper's tasks, pose reconstruction, the ablations."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 from vrrt_jax.bench.methods import CONFIGS, METHODS
@@ -76,7 +77,7 @@ def benchmark(
         if value not in known:
             names = ", ".join(str(n) for n in known if n is not None)
             raise ValueError(f"unknown {name} '{value}'; have: {names}")
-    if tasks_per_level < 1 or not levels or min(levels) <= 0:
+    if tasks_per_level < 1 or not levels or not all(0 < level < math.inf for level in levels):
         raise ValueError(
             f"got levels {list(levels)} and {tasks_per_level} tasks a level; expected distances "
             "above 0 and at least one task"

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax import planner
-from vrrt_jax.core.edges import free_along
+from vrrt_jax.core.edges import free_along, joint_error
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.search import make_stop, search
 from vrrt_jax.core.timing import interleaved_ms
@@ -95,7 +95,8 @@ def _outcome(problem: Problem, seeds: int) -> dict:
         )
         error = np.nan
         if problem.true_goal is not None:
-            error = float(np.abs(result.q_goal - problem.true_goal).mean())
+            apart = joint_error(problem.world, result.q_goal, problem.true_goal)
+            error = float(apart.mean())
         rows.append((result.ok, result.timing["search_s"], error, result.cost, result.iterations))
     table = np.array(rows, float)
     return {

@@ -109,10 +109,20 @@ def _variants(results: dict[str, Any]) -> dict[str, Any]:
 
 def _label(results: dict[str, Any]) -> str:
     method = results["variants"][0]["method"]
-    if method != "vrrt":
-        return method
-    views = ", two views" if results["scenery"]["views"] == 2 else ""
-    return ("vrrt, paper's settings" if _is_paper(results) else "vrrt, default") + views
+    if method == "vrrt":
+        method += ", paper's settings" if _is_paper(results) else ", default"
+    return ", ".join([method, *_unusual(results["scenery"])])
+
+
+def _unusual(scenery: dict[str, Any]) -> list[str]:
+    """How it differs from the usual one."""
+    said = {
+        "two views": scenery["views"] == 2,
+        "occluded": scenery["occluded"],
+        f"light {scenery['light']:g}": scenery["light"] != 1.0,
+        f"azimuth {scenery['azimuth_deg']:g}": scenery["azimuth_deg"] != 0.0,
+    }
+    return [name for name, holds in said.items() if holds]
 
 
 def _is_paper(results: dict[str, Any]) -> bool:
@@ -152,7 +162,7 @@ def _overview(found: Sequence[dict[str, Any]]) -> str:
                     if (results["what"], results["robot"]) == ("visual", robot)
                     and results["variants"][0]["method"] == method
                     and (method != "vrrt" or _is_paper(results) == is_paper)
-                    and results["scenery"]["views"] == 1
+                    and not _unusual(results["scenery"])
                 ]
                 ours = _percent(own[0]["average_success"]) if own else "not run"
                 n = f" (n = {len(own[0]['tasks'])})" if own else ""

@@ -7,7 +7,7 @@ import zlib
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.edges import difference, into_limits
+from vrrt_jax.core.edges import into_limits
 from vrrt_jax.core.types import Obstacle
 from vrrt_jax.core.verify import contacts, verify_path
 from vrrt_jax.core.world import World, batch_is_free, build_world, obstacle_list
@@ -21,6 +21,7 @@ from vrrt_jax.splat.types import Camera
 
 ROBOTS = ("panda", "ur5e", "fetch")
 WORLDS_PER_ROBOT = 6
+MOST_DRAWS = 400  # of 256 pairs of ends each
 NUM_SLOTS = 12  # one shape for all worlds, so that none re-compiles
 IMAGE_PX = 480
 AZIMUTHS_DEG = (180.0, 90.0)  # of the first and the second view: from the front, from the right
@@ -81,6 +82,9 @@ def make_task(robot_name: str, level: float, index: int, seed: int, *, obstacles
         index: of the task at this level.
         seed: of the benchmark.
         obstacles: whether there are any.
+
+    Raises:
+        ValueError: there seems to be no such task.
     """
     robot = bench_robot(robot_name)
     name = f"{robot_name}_{1 + index % WORLDS_PER_ROBOT}" if obstacles else ""
@@ -88,7 +92,7 @@ def make_task(robot_name: str, level: float, index: int, seed: int, *, obstacles
     listed = obstacle_list(world)
     key = f"{robot_name} {level:.3f} {index} {obstacles}"
     rng = np.random.default_rng([seed, zlib.crc32(key.encode())])
-    while True:
+    for _ in range(MOST_DRAWS):
         q_start = rng.uniform(robot.lower, robot.upper, (256, robot.num_joints))
         step = rng.normal(size=q_start.shape)
         q_goal = q_start + level * step / np.linalg.norm(step, axis=1, keepdims=True)
@@ -110,11 +114,10 @@ def make_task(robot_name: str, level: float, index: int, seed: int, *, obstacles
                 q_goal=ends[1],
                 straight_is_blocked=not straight.ok,
             )
-
-
-def joint_error(world: World, q: np.ndarray, q_goal: np.ndarray) -> np.ndarray:
-    """Distance (D,) of each joint from the goal, the short way round [rad] or [m]."""
-    return np.abs(np.asarray(difference(world, jnp.asarray(q), jnp.asarray(q_goal))))
+    raise ValueError(
+        f"found no free start and goal of '{robot_name}' {level:g} rad apart; expected levels such "
+        "as the paper's, 0.5 to 2.5 rad"
+    )
 
 
 @functools.cache

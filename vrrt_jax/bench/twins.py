@@ -14,9 +14,9 @@ from vrrt_jax.bench.tasks import (
     bench_world,
     goal_images,
     image_psnr,
-    joint_error,
     make_task,
 )
+from vrrt_jax.core.edges import joint_error
 
 LEVELS = (0.5, 1.0, 1.5, 2.0, 2.5)  # distances from start to goal [rad]
 LOOKED_AT = 5  # tasks a level whose images are compared

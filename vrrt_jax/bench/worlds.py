@@ -17,6 +17,7 @@ SIZE = (0.06, 0.14)  # [m] radii and half edges
 LENGTH = (0.15, 0.35)  # [m] half lengths of capsules and cylinders
 SHELL = (0.25, 0.85)  # distance of centres from the workspace's, in its radii
 COLOURS = ((0.30, 0.50, 0.75), (0.85, 0.65, 0.25), (0.85, 0.45, 0.30), (0.45, 0.65, 0.45))
+MOST_DRAWS = 1000  # of an obstacle
 
 
 def random_world(robot: Robot, seed: int) -> list[Obstacle]:
@@ -41,12 +42,17 @@ def random_world(robot: Robot, seed: int) -> list[Obstacle]:
             "'home' in its file"
         )
     num = int(rng.integers(COUNT[0], COUNT[1] + 1))
-    while len(obstacles) <= num:
+    for _ in range(MOST_DRAWS):
+        if len(obstacles) > num:
+            return obstacles
         obstacle = _random_obstacle(len(obstacles), centre, radius, rng)
         touching = contacts(robot, [*obstacles, obstacle], robot.home, geometry="spheres")
         if obstacle.position[2] > 0.1 and not touching:
             obstacles.append(obstacle)
-    return obstacles
+    raise ValueError(
+        f"found room for {len(obstacles) - 1} obstacles around the robot, expected {num}; it is "
+        f"too small for obstacles of {SIZE[0]} to {SIZE[1]} m"
+    )
 
 
 def _random_obstacle(

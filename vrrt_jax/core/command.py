@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-EXIT_SOLVED, EXIT_UNSOLVED, EXIT_BAD_INPUT = 0, 1, 2
+EXIT_SOLVED, EXIT_UNSOLVED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
 class Parser(argparse.ArgumentParser):
@@ -31,7 +31,7 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
     """Run what the chosen sub-command has set as ``run``; bad input becomes one line.
 
     Returns:
-        The exit code: 0 solved or done, 1 not solved, 2 bad input.
+        The exit code: 0 solved or done, 1 not solved, 2 bad input, 130 interrupted.
     """
     arguments = parser.parse_args(argv)
     _use_compilation_cache(parser.prog)
@@ -40,6 +40,9 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
     except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
         print(f"{parser.prog} {arguments.command}: {error}", file=sys.stderr)
         return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        print(f"{parser.prog} {arguments.command}: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
 
 
 def end_with_parent() -> None:

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 Edge = Any
 
@@ -140,6 +141,11 @@ def short_way(step: jax.Array, wraps: jax.Array) -> jax.Array:
 def difference(world: Straight, q_from: jax.Array, q_to: jax.Array) -> jax.Array:
     """The step (..., D) from one configuration to another, the short way round."""
     return short_way(q_to - q_from, world.wraps)
+
+
+def joint_error(world: Straight, q: np.ndarray, q_goal: np.ndarray) -> np.ndarray:
+    """Distance (D,) of each joint from a goal, the short way round [rad] or [m]; on the host."""
+    return np.abs(np.asarray(difference(world, jnp.asarray(q), jnp.asarray(q_goal))))
 
 
 def distance(world: Space, q_a: jax.Array, q_b: jax.Array) -> jax.Array:

@@ -58,11 +58,11 @@ def load_obstacles(path: str | Path) -> list[Obstacle]:
         ValueError: not MJCF, a body that moves, or a geom of another kind.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        Path(path).read_bytes()
     except OSError as error:
         raise FileNotFoundError(f"cannot read the world '{path}': {error.strerror}") from None
     try:
-        model = mujoco.MjModel.from_xml_string(text)
+        model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise ValueError(f"'{path}' is not a valid MJCF world: {error}") from None
     if model.njnt:

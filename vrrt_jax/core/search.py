@@ -58,10 +58,11 @@ class SearchResult:
     """A finished search."""
 
     tree: Tree
-    stopped: Stopped
+    stopped: Stopped  # of a batch, the last of them in the order above
     history: np.ndarray  # (chunks + 1, 4): iteration, seconds, best score, nodes
     compile_s: float
     search_s: float
+    stopped_each: tuple[Stopped, ...] = ()  # of the problems of a batch
 
 
 def make_stop(
@@ -171,25 +172,25 @@ def search(
 
     history = [_record(state, 0.0)]
     started = time.perf_counter()
-    with _interruptible() as interrupted:
+    with interruptible() as interrupted:
         while True:
             state, codes = jax.block_until_ready(advance(state, stop, key, jnp.int32(CHUNK)))
             seconds = time.perf_counter() - started
             history.append(_record(state, seconds))
             if on_progress is not None:
                 on_progress(state, seconds)
-            code = int(np.min(codes))
-            if code >= 0:
-                break
+            codes = np.atleast_1d(codes)
             if interrupted.is_set():
-                code = Stopped.INTERRUPTED
+                codes = np.where(codes != Stopped.REACHED, Stopped.INTERRUPTED, codes)
+            elif seconds >= time_limit_s:
+                codes = np.where(codes < 0, Stopped.TIME_LIMIT, codes)
+            if np.min(codes) >= 0:
                 break
-            if seconds >= time_limit_s:
-                code = Stopped.TIME_LIMIT
-                break
+    each = tuple(Stopped(code) for code in codes.tolist())
     return SearchResult(
         tree=state.tree,
-        stopped=Stopped(code),
+        stopped=max(each),
+        stopped_each=each,
         history=np.array(history),
         compile_s=compile_s,
         search_s=time.perf_counter() - started,
@@ -203,13 +204,22 @@ def _record(state: SearchState, seconds: float) -> tuple[float, float, float, fl
     return float(np.max(tree.iteration)), seconds, float(best), float(np.max(tree.size))
 
 
+_interrupted: list[threading.Event] = []  # of the outermost block that runs
+
+
 @contextlib.contextmanager
-def _interruptible() -> Iterator[threading.Event]:
-    """Turn Ctrl-C into a flag, so that the best path so far survives it; a second one is fatal."""
-    event = threading.Event()
+def interruptible() -> Iterator[threading.Event]:
+    """Turn Ctrl-C into a flag, so that the best path so far survives it; a second one is fatal.
+
+    Blocks inside each other share the flag.
+    """
     if threading.current_thread() is not threading.main_thread():
-        yield event
+        yield threading.Event()
         return
+    if _interrupted:
+        yield _interrupted[0]
+        return
+    event = threading.Event()
 
     def on_interrupt(signum, frame):
         if event.is_set():
@@ -217,7 +227,9 @@ def _interruptible() -> Iterator[threading.Event]:
         event.set()
 
     previous = signal.signal(signal.SIGINT, on_interrupt)
+    _interrupted.append(event)
     try:
         yield event
     finally:
+        _interrupted.clear()
         signal.signal(signal.SIGINT, previous)

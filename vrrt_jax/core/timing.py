@@ -43,10 +43,16 @@ def machine() -> dict[str, str | int]:
     """What a benchmark ran on, for its report."""
     return {
         "processor": _processor(),
-        "cores": os.cpu_count() or 1,
+        "cores": _cores(),
         "platform": platform.platform(),
         "device": str(jax.devices()[0]),
     }
+
+
+def _cores() -> int:
+    """Those that this process may use."""
+    usable = getattr(os, "sched_getaffinity", None)
+    return len(usable(0)) if usable else os.cpu_count() or 1
 
 
 def _processor() -> str:

@@ -202,4 +202,4 @@ def _add_obstacle(spec: mujoco.MjSpec, obstacle: Obstacle, bits: int) -> None:
     body = spec.worldbody.add_body(
         name=f"obstacle: {obstacle.name}", pos=obstacle.position, quat=obstacle.quaternion
     )
-    body.add_geom(type=_KINDS[obstacle.kind], size=size, contype=bits, conaffinity=bits & ~1)
+    body.add_geom(type=_KINDS[obstacle.kind], size=size, contype=bits, conaffinity=bits)

@@ -27,6 +27,7 @@ def read_spec(path: Path) -> mujoco.MjSpec:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise ValueError(_unreadable(path, error)) from None
+    spec.option.disableflags = 0  # a file may switch contacts off
     # A URDF fuses links without a joint of their own into their parents: their names would be lost.
     spec.compiler.fusestatic = False
     for kind, elements in (("body", spec.bodies), ("joint", spec.joints)):
@@ -120,6 +121,18 @@ def collide_visuals(spec: mujoco.MjSpec) -> None:
             geom.contype = geom.conaffinity = 1
         else:
             spec.delete(geom)
+
+
+def warn_of_loops(spec: mujoco.MjSpec) -> None:
+    """Tell which closed loops of linkages come open, as only trees of joints are planned."""
+    loops = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
+    pairs = [f"{e.name1} and {e.name2}" for e in spec.equalities if e.type in loops]
+    if pairs:
+        warnings.warn(
+            f"what ties {'; '.join(pairs)} together is not kept: fix the joints of such a linkage "
+            "with freeze, or they move each by itself",
+            stacklevel=3,
+        )
 
 
 def strip_spec(spec: mujoco.MjSpec, *, visuals: bool) -> None:

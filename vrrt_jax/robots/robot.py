@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -86,7 +87,15 @@ def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None =
         if found.origin == "fitted":
             thin_spheres = thin.refine(model, thin_spheres, sample, allowed, write)
         draft = mujoco.MjModel.from_xml_string(write(thin=thin_spheres, allowed=allowed))
-        allowed += pairs.always_touching(draft)
+        always = pairs.always_touching(draft)
+        if always:
+            warnings.warn(
+                f"the spheres of {'; '.join(' and '.join(pair) for pair in always)} touch at home, "
+                "so that these bodies are never checked against each other; fit finer ones with: "
+                "vrrt spheres",
+                stacklevel=2,
+            )
+        allowed += always
     xml = write(thin=thin_spheres, allowed=allowed)
     return _robot(
         model=mujoco.MjModel.from_xml_string(xml), allowed=tuple(allowed), xml=xml, **fields
@@ -111,6 +120,7 @@ def _reduce(
     spec: mujoco.MjSpec, path: Path, freeze: Mapping[str, float] | None
 ) -> tuple[mujoco.MjModel, np.ndarray, dict[str, float]]:
     """The model with planned joints only, its home (D,), and the joints that were fixed."""
+    mjcf.warn_of_loops(spec)
     mjcf.strip_spec(spec, visuals=False)
     model = mjcf.compile_spec(spec, path)
     home = mjcf.home_positions(model)

@@ -142,7 +142,7 @@ def mesh_file(mesh_source: str | None) -> Path | None:
     if mesh_source is None:
         return None
     if mesh_source not in _SOURCES:
-        return Path(mesh_source)
+        return Path(mesh_source) if Path(mesh_source).is_file() else None
     return _found(_SOURCES[mesh_source])
 
 
