@@ -21,6 +21,7 @@ PAPER_NOTE = (
     "an NVIDIA RTX 4090; 21.6 s a plan for the Panda."
 )
 CAUSE_COLOURS = ("#4878a8", "#d9903d", "#ecc68f", "#8a8a8a", "#c4c4c4", "#7a5aa6", "#b5433f")
+SOLVED_COLOUR = "#8fbc8f"
 
 
 def to_text(results: dict[str, Any]) -> str:
@@ -85,8 +86,12 @@ def write_page(files: Sequence[Path], folder: Path) -> Path:
             seen = f"self-model {seen}" if seen else "an earlier self-model"
             parts += [f"`{_command(results)}`{where}, {seen}", "", to_text(results), ""]
         name = f"{what}_{robot}.png"
-        _figure(group, folder / name)
-        parts += [f"![success, causes, times and path lengths]({name})", ""]
+        if what == "ablation":
+            _ablation_figure(group, folder / name)
+            parts += [f"![success and causes of failure by setting]({name})", ""]
+        else:
+            _figure(group, folder / name)
+            parts += [f"![success, causes, times and path lengths]({name})", ""]
     page = folder / "README.md"
     page.write_text("\n".join(parts))
     return page
@@ -224,6 +229,39 @@ def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
     by_level.legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.17))
     causes.legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.17))
     figure.suptitle(f"{group[0]['what']}: {group[0]['robot']}")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _ablation_figure(group: Sequence[dict[str, Any]], path: Path) -> None:
+    """What becomes of the tasks with each value of each setting."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    labels, stacks = [], []
+    for results in sorted(group, key=_is_paper, reverse=True):
+        base = "paper's" if _is_paper(results) else "default"
+        for name, summary in _variants(results).items():
+            levels = summary["levels"]
+            total = sum(v["n"] for v in levels)
+            counts = [sum(v["causes"].get(c, 0) for v in levels) for c in CAUSES]
+            labels.append(f"{base}, {name} (n = {total})")
+            stacks.append([100 * count / total for count in (total - sum(counts), *counts)])
+    figure, axis = plt.subplots(figsize=(10, 1.5 + 0.24 * len(labels)), layout="constrained")
+    left = [0.0] * len(labels)
+    for k, (name, colour) in enumerate(
+        zip(("solved", *CAUSES), (SOLVED_COLOUR, *CAUSE_COLOURS), strict=True)
+    ):
+        width = [stack[k] for stack in stacks]
+        axis.barh(labels, width, left=left, color=colour, label=name)
+        left = [a + b for a, b in zip(left, width, strict=True)]
+    axis.set(xlabel="tasks [%]", xlim=(0, 100))
+    axis.margins(y=0.01)
+    axis.invert_yaxis()
+    figure.legend(fontsize="small", ncols=4, loc="outside lower center")
+    figure.suptitle(f"ablation: {group[0]['robot']}")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
