@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax.models import CVAE, Discriminator, ModelConfig
+from vrrt_jax.core.files import replacing
 
 VERSION = 2  # of what the networks see, see :mod:`nrp_jax.features`
 
@@ -44,10 +45,8 @@ def save_model(model: Model, path: str | Path) -> None:
     }
     config = dataclasses.asdict(model.config)
     description = json.dumps({"version": VERSION, "config": config, "info": model.info})
-    part = path.with_suffix(".part")
-    with open(part, "wb") as handle:
+    with replacing(path) as handle:
         np.savez_compressed(handle, description=np.array(description), **arrays)
-    part.replace(path)
 
 
 def load_model(path: str | Path) -> Model:

@@ -20,6 +20,7 @@ import numpy as np
 from nrp_jax import houses
 from nrp_jax.grid import Grid
 from vrrt_jax.core.command import end_with_parent
+from vrrt_jax.core.files import UNFINISHED, replacing
 
 VERSION = 4  # of the rows
 MANIFEST = "manifest.json"
@@ -93,7 +94,7 @@ def write_dataset(
     for name, entry in _run(out, settings, todo, jobs):
         manifest["shards"][name] = entry
         manifest["rows"] = sum(shard["rows"] for shard in manifest["shards"].values())
-        _write_atomically(out / MANIFEST, json.dumps(manifest, indent=1).encode())
+        _write_manifest(out, manifest)
         done += 1
         if on_progress is not None:
             on_progress(done, len(wanted))
@@ -176,15 +177,13 @@ def make_shard(settings: Settings, split: str, index: int, path: Path) -> dict[s
         settings.queries,
         settings.waypoints,
     )
-    scratch = path.with_suffix(f".{os.getpid()}.tmp")
-    with scratch.open("wb") as file:
+    with replacing(path) as file:
         np.savez_compressed(
             file,
             occupied=np.packbits(house.grid.occupied, axis=-1),
             layers=house.grid.occupied.shape[2],
             **{key: getattr(rows, key) for key in ROWS},
         )
-    os.replace(scratch, path)
     return {"rows": len(rows.ratio), "seed": seed, "sha256": _checksum(path)}
 
 
@@ -247,10 +246,10 @@ def _open(out: Path, settings: Settings) -> dict[str, Any]:
     """The manifest of a new or fitting data set; old scratch files go."""
     out.mkdir(parents=True, exist_ok=True)
     if not (out / MANIFEST).exists():
-        if any(not path.name.endswith(".tmp") for path in out.iterdir()):
+        if any(path.suffix != UNFINISHED for path in out.iterdir()):
             raise ValueError(f"folder '{out}' is not empty and holds no data set; take another")
         manifest = {"settings": dataclasses.asdict(settings), "rows": 0, "shards": {}}
-        _write_atomically(out / MANIFEST, json.dumps(manifest, indent=1).encode())
+        _write_manifest(out, manifest)
     manifest = _read_manifest(out)
     for key, value in dataclasses.asdict(settings).items():
         if manifest["settings"].get(key) != value:
@@ -258,7 +257,7 @@ def _open(out: Path, settings: Settings) -> dict[str, Any]:
                 f"the data set in '{out}' was made with {key} {manifest['settings'].get(key)}, not "
                 f"{value}; take another folder, or the same settings"
             )
-    for path in out.glob("*.tmp"):
+    for path in out.glob(f"*{UNFINISHED}"):
         path.unlink()
     return manifest
 
@@ -288,10 +287,9 @@ def _checksum(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _write_atomically(path: Path, content: bytes) -> None:
-    scratch = path.with_suffix(f".{os.getpid()}.tmp")
-    scratch.write_bytes(content)
-    os.replace(scratch, path)
+def _write_manifest(out: Path, manifest: dict[str, Any]) -> None:
+    with replacing(out / MANIFEST, "w") as file:
+        file.write(json.dumps(manifest, indent=1))
 
 
 def _name(split: str, index: int) -> str:

@@ -18,7 +18,7 @@ from nrp_jax.field import Field, make_field
 from nrp_jax.grid import RESOLUTION, Grid
 from nrp_jax.houses import CELLS
 from nrp_jax.models import ModelConfig
-from nrp_jax.robots import MobileRobot, link_features
+from nrp_jax.robots import MobileRobot, batch_link_features
 from vrrt_jax.core.types import pytree
 
 
@@ -160,7 +160,8 @@ def make_examples(
     filled = np.arange(counts.max()) < counts[:, None]
     ends = np.stack([rows["q_start"][first], rows["q_goal"][first]], axis=1)
     q = np.concatenate([ends, rows["waypoint"][table]], axis=1).astype(np.float32)
-    points = _frames(robot, q.reshape(-1, q.shape[-1]))
+    # Once for all rows: kinematics inside the training step would take longest of all to compile.
+    points = batch_link_features(robot, q.reshape(-1, q.shape[-1]))
     return Examples(
         maps=jnp.asarray(maps),
         home=jnp.asarray(rows["home"][first], jnp.int32),
@@ -169,10 +170,6 @@ def make_examples(
         target=jnp.asarray(target[table], jnp.float32),
         weight=jnp.asarray(weight[table] * filled, jnp.float32),
     )
-
-
-# Once for all rows: kinematics inside the training step would take longest of all to compile.
-_frames = jax.jit(jax.vmap(link_features, (None, 0)))
 
 
 def _stack(maps: list[jax.Array], config: ModelConfig) -> np.ndarray:

@@ -17,7 +17,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
-from nrp_jax.robots import MobileRobot, link_features
+from nrp_jax.robots import MobileRobot, batch_link_features
 from nrp_jax.world import GridWorld, batch_is_free
 from vrrt_jax.core.rrt import sample_configurations
 
@@ -112,7 +112,7 @@ class Extents:
 
     def __init__(self, robot: MobileRobot, q: np.ndarray):
         """Of configurations ``q`` (N, D)."""
-        points = np.asarray(_features(robot, jnp.asarray(q)))[..., :2] - q[:, None, :2]
+        points = np.asarray(batch_link_features(robot, jnp.asarray(q)))[..., :2] - q[:, None, :2]
         radius = BODY_RADIUS[robot.name]
         self.base = q[:, :2]
         self.low = np.minimum(points.min(1), -radius)  # (N, 2) [m]
@@ -123,9 +123,6 @@ class Extents:
         step = self.base[who] - self.base[whose]
         far = np.maximum(step + self.high[who], -step - self.low[who])
         return (far < HALF_WINDOW).all(-1)
-
-
-_features = jax.jit(jax.vmap(link_features, (None, 0)))
 
 
 def _neighbours(world: GridWorld, robot: MobileRobot, q: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 import optax
 import orbax.checkpoint as ocp
 
+from vrrt_jax.core.files import replacing
 from vrrt_jax.core.types import pytree
 
 SECONDS_BETWEEN = 10.0  # checkpoints
@@ -87,20 +88,17 @@ def claim(out: Path, parts: dict[str, Any]) -> Path:
             f"'{out}' holds a training of another model, data set or settings; choose another "
             "folder with --out, or delete it"
         )
-    part = file.with_suffix(".part")
-    part.write_text(text)
-    part.replace(file)
+    with replacing(file, "w") as handle:
+        handle.write(text)
     return out
 
 
 def write_log(history: list[dict[str, float]], out: Path) -> None:
     """Write ``log.csv``."""
-    part = out / "log.part"
-    with open(part, "w", newline="") as handle:
+    with replacing(out / "log.csv", "w") as handle:
         writer = csv.DictWriter(handle, list(history[0]))
         writer.writeheader()
         writer.writerows(history)
-    part.replace(out / "log.csv")
 
 
 def plot_curves(history: list[dict[str, float]], path: Path, title: str) -> None:

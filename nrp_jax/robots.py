@@ -86,6 +86,9 @@ def link_features(robot: MobileRobot, q: jax.Array) -> jax.Array:
     return points * jnp.array([1.0, 1.0, 0.0]) if robot.planar else points
 
 
+batch_link_features = jax.jit(jax.vmap(link_features, (None, 0)))
+
+
 @functools.cache
 def load_robot(name: str) -> MobileRobot:
     """Load "snake" (8 joints) or "fetch" (11 joints).

@@ -17,7 +17,7 @@ from nrp_jax.context import SIDE
 from nrp_jax.examples import describe, read, relations, surrounding_map, view
 from nrp_jax.grid import HEIGHT, RESOLUTION
 from nrp_jax.models import CVAE, ModelConfig, check_choices
-from nrp_jax.robots import MobileRobot, link_features, load_robot
+from nrp_jax.robots import MobileRobot, batch_link_features, load_robot
 from nrp_jax.world import GridWorld
 from vrrt_jax.core.edges import difference, into_limits, points_along
 from vrrt_jax.core.types import pytree, static
@@ -104,7 +104,7 @@ class Discriminator:
         shape = (len(q_from), round(self.candidates / POSTURES), POSTURES)
         place = jax.random.uniform(key_place, (*shape, 2), minval=-REACH, maxval=REACH)
         q = _postures(self.robot, world, q_from, q_goal, key_posture)
-        frames = jax.vmap(jax.vmap(lambda q: link_features(self.robot, q)))(q)
+        frames = jax.vmap(batch_link_features, (None, 0))(self.robot, q)
         q = jnp.broadcast_to(q[:, None], (*shape, q.shape[-1])).at[..., :2].set(place)
         frames = frames[:, None] + jnp.pad(place, [(0, 0)] * 3 + [(0, 1)])[..., None, :]
         return jax.tree.map(
@@ -159,7 +159,7 @@ def _look(
     image, centre = jax.vmap(lambda q: view(config, padded, q, resolution, origin))(q_from)
     ends = jnp.stack([q_from, q_goal], axis=1)
     ends = features.to_local(ends, centre[:, None])
-    points = jax.vmap(jax.vmap(lambda q: link_features(robot, q)))(ends)
+    points = jax.vmap(batch_link_features, (None, 0))(robot, ends)
     return _Sight(
         image=image,
         centre=centre,

@@ -29,6 +29,7 @@ from nrp_jax.grid import Grid, load_map
 from nrp_jax.models import KINDS, TASKS
 from nrp_jax.robots import MobileRobot, load_robot
 from nrp_jax.world import GridWorld, batch_is_free, build_world
+from vrrt_jax.core.files import replacing
 from vrrt_jax.core.timing import machine
 
 ROUND = 256  # edges from a waypoint into the roadmap that are checked before the next are looked at
@@ -200,12 +201,10 @@ def _roadmap(
     if not file.exists():
         roadmap = build_roadmap(world, robot, jax.random.key(seed), nodes)
         cache.mkdir(parents=True, exist_ok=True)
-        part = file.with_suffix(".part")
-        with open(part, "wb") as handle:
+        with replacing(file) as handle:
             graph = {name: getattr(roadmap.lengths, name) for name in ("data", "indices", "indptr")}
             rest = {"colliding": roadmap.colliding, "checked": roadmap.checked}
             np.savez(handle, q=roadmap.q, **graph, **rest)
-        part.replace(file)
         return roadmap
     with np.load(file) as saved:
         parts = (saved["data"], saved["indices"], saved["indptr"])

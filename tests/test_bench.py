@@ -162,10 +162,10 @@ def test_full_disk_keeps_what_was_done(tmp_path, monkeypatch):
     def full(self, *args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(type(file), "write_text", full)
+    monkeypatch.setattr(type(file), "replace", full)
     with pytest.raises(OSError, match="No space left.*goes on from there"):
         runner.run(_benchmark(), file)
-    assert file.read_text() == before
+    assert file.read_text() == before and list(tmp_path.iterdir()) == [file]
 
 
 def test_summary():

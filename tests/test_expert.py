@@ -99,7 +99,7 @@ def test_roadmap(robot, world, roadmap):
     assert abs(lengths - lengths.T).max() == 0
     a, b = lengths.nonzero()
     assert np.abs(q[a, :2] - q[b, :2]).max() < 2.0
-    tips = np.asarray(expert._features(robot, q))[:, :, :2]
+    tips = np.asarray(expert.batch_link_features(robot, q))[:, :, :2]
     assert np.abs(tips[b] - q[a, None, :2]).max() < 2.0
     assert np.isfinite(path_lengths(roadmap, 0)).all()
 

@@ -8,6 +8,7 @@ import pytest
 from vrrt_jax.robots import load_robot
 from vrrt_jax.robots.sources import mesh_spec
 from vrrt_jax.splat import fit
+from vrrt_jax.splat.camera import orbit
 from vrrt_jax.splat.model import load_self_model
 from vrrt_jax.splat.mujoco_images import MeshRenderer
 
@@ -52,6 +53,13 @@ def arm(tmp_path_factory):
     except RuntimeError as error:
         pytest.skip(str(error))
     return robot, spec
+
+
+def test_too_large_an_image_is_refused(arm):
+    robot, spec = arm
+    camera = orbit(azimuth_deg=0, elevation_deg=-20, distance=2.0, height=600, width=1100)
+    with pytest.raises(ValueError, match="1100x600 px is too large .* at most 1024"):
+        MeshRenderer(spec).picture(robot.lower, camera)
 
 
 def test_a_small_self_model_is_trained_and_resumed(arm, tmp_path, monkeypatch):

@@ -45,7 +45,7 @@ def test_rows_and_homes(folder):
     assert (train.grids[0].occupied == first.occupied).all()
     for grid in train.grids:
         assert (grid.occupied != test.grids[0].occupied).any()
-    assert not list(folder.glob("*.tmp"))
+    assert not list(folder.glob("*.part"))
 
 
 def test_splits_never_share_a_home():
@@ -164,10 +164,10 @@ def test_a_killed_run_leaves_what_the_next_one_finishes(tmp_path):
     assert len(manifest["shards"]) < 3
     if manifest["shards"]:
         assert len(data.load_dataset(out)) == 24 * len(manifest["shards"])
-    (out / f"train_00001.{os.getpid()}.tmp").write_bytes(b"half of a shard")
+    (out / f"train_00001.{os.getpid()}.part").write_bytes(b"half of a shard")
     data.write_dataset(out, SETTINGS, homes=2, test_homes=0)
     assert len(data.load_dataset(out)) == 48
-    assert not list(out.glob("*.tmp"))
+    assert not list(out.glob("*.part"))
 
 
 def with_border(occupied):

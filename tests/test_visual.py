@@ -16,6 +16,7 @@ import vrrt_jax
 from vrrt_jax import finish, planner
 from vrrt_jax.core import search as searches
 from vrrt_jax.core import tree as trees
+from vrrt_jax.core.edges import free_steps
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.rewire import with_costs
 from vrrt_jax.core.tree import UNREACHED, lineage
@@ -377,6 +378,44 @@ def test_ambiguous_goals_are_told(panda, self_model, camera, open_world):
     apart = np.abs(result.alternatives - HALF_TURNED).max(axis=1)
     assert len(apart) >= 1 and apart.min() < 0.3
     assert f"ambiguous: {len(apart)} other" in str(result)
+
+
+SLIDER = """
+<mujoco>
+  <worldbody>
+    <body>
+      <joint name="slide" type="slide" axis="1 0 0" range="-1 1"/>
+      <geom type="box" size="0.1 0.1 0.1"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("margin, granted", [(0.0, True), (0.005, False)])
+def test_a_straight_way_that_only_the_spheres_refuse(tmp_path, margin, granted):
+    path = tmp_path / "slider.xml"
+    path.write_text(SLIDER)
+    robot = vrrt_jax.load_robot(path)
+    near = vrrt_jax.Obstacle(
+        name="near", kind="box", position=(0.0, 0.152, 0.0), size=(0.05, 0.05, 0.05)
+    )
+    world = vrrt_jax.build_world(robot, [near], margin=margin)
+    ends = np.array([[-0.5], [0.5]], np.float32)
+    found = searches.SearchResult(
+        tree=trees.create(jnp.asarray(ends), jnp.zeros(2), None, 8),
+        stopped=searches.Stopped.CONVERGED,
+        history=np.zeros((1, 4)),
+        compile_s=0.0,
+        search_s=0.0,
+    )
+    steps = int(free_steps(world, jnp.asarray(ends[:1]), jnp.asarray(ends[1:]), 64)[0])
+    assert 0 < steps < 64
+    config = planner.PlannerConfig(lanes=4, capacity=64, connect_iterations=5)
+    _, way = finish._connected(robot, world, found, *ends, jax.random.key(0), config)
+    assert (way is not None) == granted
+    if granted:
+        np.testing.assert_array_equal(way, ends)
 
 
 def test_another_attempt_while_nothing_matches(panda, self_model, camera, image, open_world):

@@ -54,7 +54,7 @@ class PlannerConfig:
     min_ratio: float = 0.97  # ... and below this share of the one before
     attempts: int = 2  # the later ones from other probes, while no path is found and verified
     time_limit_s: float = float("inf")  # of all searches, compilation excluded [s]
-    connect_iterations: int = 100  # of RRT-Connect, to a match; more in a later attempt
+    connect_iterations: int = 400  # of RRT-Connect, to a match
     shortcut_rounds: int = 150
     verify_step: float = 0.005  # [rad]
     lanes: int = 32  # expansions an iteration (re-compiles)

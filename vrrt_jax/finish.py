@@ -31,6 +31,7 @@ HURRIED = (Stopped.TIME_LIMIT, Stopped.INTERRUPTED)  # what ends these, ends all
 TRIED = 3  # matched configurations that are tried before there is no path
 REFUSED = 3  # paths that the exact check may refuse before it has the last word
 WARY = 0.01  # [m] by which each of them keeps farther away than the one before
+GLANCE = 0.02  # [rad] between configurations of a straight line that is tried
 SAME_LOSS = 1.05  # losses within this factor are the same match
 ALIKE = 1.1  # and within this factor the image does not tell which it is
 
@@ -78,7 +79,7 @@ def finish_visual(
     for end in ends[:TRIED]:
         path = paths.get(end)
         if path is None:
-            found, path = _connected(world, found, q_start, q[end], key, config)
+            found, path = _connected(robot, world, found, q_start, q[end], key, config)
         if path is not None or found.stopped in HURRIED:
             break
     if path is None:
@@ -94,7 +95,7 @@ def finish_visual(
         idle = dataclasses.replace(found, compile_s=0.0, search_s=0.0)
         rest = time_left(config, result.timing["search_s"])
         wary = with_margin(world, again * WARY)
-        other, path = _connected(wary, idle, q_start, target, key, rest)
+        other, path = _connected(robot, wary, idle, q_start, target, key, rest)
         other = finish(robot, wary, other, path, target, loss, goal_loss, key, config, q_start)
         result = with_time_of(other if other.ok else result, result, other)
     return dataclasses.replace(result, alternatives=q[alike], search_goal_loss=search_goal_loss)
@@ -121,6 +122,7 @@ def _distinct(
 
 
 def _connected(
+    robot: Robot,
     world: World,
     found: SearchResult,
     q_start: np.ndarray,
@@ -128,10 +130,17 @@ def _connected(
     key: jax.Array,
     config: PlannerConfig,
 ) -> tuple[SearchResult, np.ndarray | None]:
-    """A path (P, D) by RRT-Connect, if there is one; its time is added to the search's.
+    """A path (P, D), straight or by RRT-Connect, if there is one; its time joins the search's.
 
     If time is up meanwhile, or the user interrupts, the search has stopped for that.
     """
+    started = time.perf_counter()
+    straight = np.stack([q_start, q_goal])  # the exact check also grants what the spheres refuse
+    seen = verify_path(robot, obstacle_list(world), straight, step=GLANCE)
+    spent_s = time.perf_counter() - started
+    found = dataclasses.replace(found, search_s=found.search_s + spent_s)
+    if seen.ok and not seen.clearance < world.margin:
+        return found, straight
     policy = RRTConnect(lanes=config.lanes)
     tree = policy.forest(jnp.asarray(q_start), jnp.asarray(q_goal), config.capacity)
     stop = make_stop(0.0, max_iterations=config.connect_iterations)

@@ -24,7 +24,6 @@ from vrrt_jax.visual import best_probes, forest, plant
 
 PLANTING = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
 AGAIN = (Status.NO_MATCH, Status.NO_PATH, Status.NOT_VERIFIED)  # worth another attempt
-PERSISTENCE = 4  # later attempts take so many times the iterations to find a way to a match
 RRT_STAR_RADIUS = 1.9  # [rad] nodes of a sparse tree in seven dimensions lie that far apart
 
 
@@ -77,8 +76,6 @@ def plan(
             if result.status not in AGAIN or rest.time_limit_s == 0:
                 break
             key = jax.random.fold_in(key, PLANTING - again)
-            longer = PERSISTENCE * config.connect_iterations
-            rest = dataclasses.replace(rest, connect_iterations=longer)
             other = _attempt(robot, world, setup, roots, key, rest, on_progress)
             best = min(result, other, key=lambda r: (not r.ok, r.loss))
             result = with_time_of(best, result, other)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import platform
 from importlib import metadata
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import vrrt_jax
 from vrrt_jax.config import PlannerConfig, PlanResult
 from vrrt_jax.core.edges import joint_error
+from vrrt_jax.core.files import replacing
 from vrrt_jax.core.shortcut import path_length
 from vrrt_jax.problems import Problem
 
@@ -72,13 +72,10 @@ def save_result(
         "history": result.history,
         "joint_names": np.array(problem.robot.joint_names),
     }
-    part = folder / ".path.npz.part"
-    with open(part, "wb") as file:
+    with replacing(folder / "path.npz") as file:
         np.savez_compressed(file, **arrays)
-    os.replace(part, folder / "path.npz")
-    part = folder / ".result.json.part"
-    part.write_text(json.dumps(summary(problem, result, config, seed), indent=2) + "\n")
-    os.replace(part, folder / "result.json")
+    with replacing(folder / "result.json", "w") as file:
+        file.write(json.dumps(summary(problem, result, config, seed), indent=2) + "\n")
 
 
 def _number(value: Any) -> Any:

@@ -17,6 +17,7 @@ from vrrt_jax.bench.methods import CAUSES, solve
 from vrrt_jax.bench.tasks import Scenery, bench_robot, make_task
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.command import end_with_parent
+from vrrt_jax.core.files import replacing
 from vrrt_jax.core.timing import machine
 from vrrt_jax.problems import self_model_path
 from vrrt_jax.report import versions
@@ -174,12 +175,10 @@ def _resume(benchmark: Benchmark, file: Path) -> dict[str, Any]:
 
 def _write(file: Path, results: dict[str, Any]) -> None:
     """Replace the file at once; if that fails, what it held stays."""
-    part = file.with_name(file.name + ".part")
     try:
-        part.write_text(json.dumps(results, indent=1) + "\n")
-        part.replace(file)
+        with replacing(file, "w") as handle:
+            handle.write(json.dumps(results, indent=1) + "\n")
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise OSError(
             f"cannot write '{file}': {error.strerror}; what it held is kept, and the same command "
             "goes on from there"

@@ -19,6 +19,7 @@ import optax
 from scipy.cluster.vq import kmeans2
 from tqdm import tqdm
 
+from vrrt_jax.core.files import replacing
 from vrrt_jax.core.kinematics import chain_from_model, link_poses
 from vrrt_jax.core.world import batch_is_free, build_world
 from vrrt_jax.robots.robot import workspace
@@ -271,8 +272,7 @@ def _cached_images(
 
 
 def _write_images(file: Path, images: Images, points: np.ndarray) -> None:
-    part = file.with_suffix(".part")
-    with open(part, "wb") as handle:
+    with replacing(file) as handle:
         np.savez(
             handle,
             q=images.q,
@@ -283,7 +283,6 @@ def _write_images(file: Path, images: Images, points: np.ndarray) -> None:
             focal=np.asarray(images.cameras.focal),
             centre=np.asarray(images.cameras.centre),
         )
-    part.replace(file)
 
 
 def _read_images(file: Path) -> tuple[Images, np.ndarray]:
@@ -461,10 +460,8 @@ def validate(robot, splats: SplatModel, images: Images) -> tuple[np.ndarray, np.
 
 def _store(file: Path, change, state, steps: int) -> None:
     leaves: list[Any] = [np.asarray(leaf) for leaf in jax.tree.leaves((change, state))]
-    part = file.with_suffix(".part")
-    with open(part, "wb") as handle:
+    with replacing(file) as handle:
         np.savez(handle, steps=steps, **{f"leaf_{i}": leaf for i, leaf in enumerate(leaves)})
-    part.replace(file)
 
 
 def _restore(file: Path, change, state):

@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.files import replacing
 from vrrt_jax.splat.types import SplatModel
 
 FORMAT = 3
@@ -69,10 +70,8 @@ def save_self_model(model: SelfModel, path: str | Path) -> None:
             value = np.asarray(getattr(level.splats, array))
             small = np.uint8 if array == "link" else np.float16 if value.ndim else np.float32
             arrays[f"{name}/{array}"] = value.astype(small)
-    part = path.with_name(path.name + ".part")
-    with open(part, "wb") as file:
+    with replacing(path) as file:
         np.savez_compressed(file, **arrays)
-    part.replace(path)
 
 
 def load_self_model(path: str | Path) -> SelfModel:

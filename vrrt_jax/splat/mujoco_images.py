@@ -135,6 +135,12 @@ class MeshRenderer:
         return renderer
 
     def _renderer(self, size: tuple[int, int]) -> mujoco.Renderer:
+        height, width = size
+        if max(size) > MAX_RENDER_PX:
+            raise ValueError(
+                f"an image of {width}x{height} px is too large to be drawn; expected at most "
+                f"{MAX_RENDER_PX} px on a side"
+            )
         if size not in self._renderers:
             try:
                 self._renderers[size] = mujoco.Renderer(self.model, *size)
