@@ -118,8 +118,8 @@ def load_map(path: str | Path) -> Grid:
 
     Args:
         path: ``.npz`` with ``occupied``, ``resolution_m`` and ``origin_m``; a ROS map's ``.yaml``
-            of mode trinary or scale (unknown pixels count as solid); or an MJCF scene ``.xml``,
-            which is cut into cells. Cells smaller than 0.1 m are joined.
+            of mode trinary or scale (unknown and transparent pixels count as solid); or an MJCF
+            scene ``.xml``, which is cut into cells. Cells smaller than 0.1 m are joined.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -203,7 +203,8 @@ def _read_ros(path: Path) -> Grid:
         )
     if not about.get("negate", 0):
         grey = 1 - grey
-    solid = ~(grey < free_below) | (grey > occupied_from)  # unknown is solid
+    clear = np.asarray(image.convert("RGBA").getchannel("A")) < 255
+    solid = ~(grey < free_below) | (grey > occupied_from) | clear  # unknown is solid
     return Grid(occupied=solid[::-1].T, resolution=resolution, origin=(origin[0], origin[1], 0.0))
 
 

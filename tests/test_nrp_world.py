@@ -241,6 +241,17 @@ def test_ros_map(tmp_path, free_thresh, negate, mode):
     assert grid.occupied[-1].all()  # half of it lies beside the map
 
 
+def test_transparent_pixels_of_a_ros_map_are_unknown(tmp_path):
+    from PIL import Image
+
+    pixels = np.full((40, 60, 2), 255, np.uint8)  # grey and alpha
+    pixels[10, 20, 1] = 0
+    Image.fromarray(pixels, "LA").save(tmp_path / "home.png")
+    (tmp_path / "home.yaml").write_text(ROS.replace("pgm", "png"))
+    grid = load_map(tmp_path / "home.yaml")
+    assert np.argwhere(grid.occupied[..., 0]).tolist() == [[10, 14]]
+
+
 def test_ros_maps_of_other_kinds_are_refused(tmp_path):
     from PIL import Image
 
