@@ -57,7 +57,8 @@ class PlanResult:
 
     status: Status
     path: np.ndarray  # (P, D) waypoints joined by the world's edges; of a failure, the best try
-    trajectory: np.ndarray  # (T, D) the same in steps of 0.02 m or rad at most
+    # (T, D) the same in steps of 0.02 m or rad at most; angles without limits may leave [-pi, pi)
+    trajectory: np.ndarray
     raw_path: np.ndarray  # (P', D) as the tree has it
     cost: float  # length of ``path``: of the base's way, and a weight times that of the arm's [m]
     verification: Verification | None  # None if the goal was not reached
@@ -212,7 +213,7 @@ def check_configuration(
 
 
 def trajectory_of(world: GridWorld, path: np.ndarray) -> np.ndarray:
-    """A path (P, D) in steps (T, D) of 0.02 m or rad at most."""
+    """A path (P, D) in steps (T, D) of 0.02 m or rad at most; angles go on where they wrap."""
     if len(path) < 2:
         return np.asarray(path)
     spans = np.asarray(_spans(world, padded(path)))[: len(path) - 1]
@@ -224,7 +225,10 @@ def trajectory_of(world: GridWorld, path: np.ndarray) -> np.ndarray:
     padding = (0, room - len(index))
     q_a, q_b = (np.pad(path[index + k], [padding, (0, 0)], mode="edge") for k in (0, 1))
     points = _interpolate(world, q_a, q_b, np.pad(fraction, padding))
-    return np.concatenate([path[:1], np.asarray(points)[: len(index)]])
+    trajectory = np.concatenate([path[:1], np.asarray(points)[: len(index)]])
+    wraps = np.asarray(world.wraps)
+    trajectory[:, wraps] = np.unwrap(trajectory[:, wraps], axis=0)
+    return trajectory
 
 
 @jax.jit

@@ -20,7 +20,7 @@ import optax
 
 from vrrt_jax import checks
 from vrrt_jax.config import PlannerConfig
-from vrrt_jax.core.edges import into_limits
+from vrrt_jax.core.edges import into_limits, joint_error
 from vrrt_jax.core.types import pytree
 from vrrt_jax.core.world import World, batch_is_free
 from vrrt_jax.planner import plan_to_configuration
@@ -240,7 +240,7 @@ def rrt_star_to_estimate(
         config=PlannerConfig(max_iterations=iterations),
     )
     reached = len(found.path) > 1 or np.allclose(q_start, q_goal, atol=1e-3)
-    reached &= bool(np.linalg.norm(found.path[-1] - q_goal) < 1e-2)
+    reached &= bool(np.linalg.norm(joint_error(world, found.path[-1], q_goal)) < 1e-2)
     return BaselineResult(
         path=found.path,
         loss=estimate.loss,

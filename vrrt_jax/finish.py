@@ -18,6 +18,7 @@ from vrrt_jax.core.types import Rejection, Status
 from vrrt_jax.core.verify import verify_path
 from vrrt_jax.core.world import World, obstacle_list, with_margin
 from vrrt_jax.polish import DISTINCT, Polishing, apart, glance, look_at, polish
+from vrrt_jax.robots.exact import exact_model
 from vrrt_jax.robots.robot import Robot
 
 STATUS_OF = {
@@ -32,6 +33,7 @@ TRIED = 3  # matched configurations that are tried before there is no path
 REFUSED = 3  # paths that the exact check may refuse before it has the last word
 WARY = 0.01  # [m] by which each of them keeps farther away than the one before
 GLANCE = 0.02  # [rad] between configurations of a straight line that is tried
+GRAZE = 0.002  # [m] that it keeps away: what links move between configurations of the last check
 SAME_LOSS = 1.05  # losses within this factor are the same match
 ALIKE = 1.1  # and within this factor the image does not tell which it is
 
@@ -67,8 +69,9 @@ def finish_visual(
         found, (q, score, cost) = _polished(found, world, polishing, q[nodes], key)
         far = apart(world, q, q_start) ** 2  # of two that look alike, the nearer is likelier
         order = np.lexsort([cost * (1.0 + config.start_preference * far), score > goal_loss])
-        ends = [int(k) for k in order if np.isfinite(cost[k])] or [0]
-        paths, rivals = {}, ends
+        rivals = [int(k) for k in order if np.isfinite(cost[k])] or [0]
+        ends = [k for k in rivals if score[k] <= goal_loss] or rivals
+        paths = {}
     else:
         if hurried and score.min() > goal_loss:  # nothing matches: the best that a path leads to
             score = np.where(np.asarray(found.tree.cost) < trees.UNREACHED, score, np.inf)
@@ -79,7 +82,9 @@ def finish_visual(
     for end in ends[:TRIED]:
         path = paths.get(end)
         if path is None:
-            found, path = _connected(robot, world, found, q_start, q[end], key, config)
+            found, path = _straight(robot, world, found, q_start, q[end])
+        if path is None:
+            found, path = _connected(world, found, q_start, q[end], key, config)
         if path is not None or found.stopped in HURRIED:
             break
     if path is None:
@@ -95,7 +100,7 @@ def finish_visual(
         idle = dataclasses.replace(found, compile_s=0.0, search_s=0.0)
         rest = time_left(config, result.timing["search_s"])
         wary = with_margin(world, again * WARY)
-        other, path = _connected(robot, wary, idle, q_start, target, key, rest)
+        other, path = _connected(wary, idle, q_start, target, key, rest)
         other = finish(robot, wary, other, path, target, loss, goal_loss, key, config, q_start)
         result = with_time_of(other if other.ok else result, result, other)
     return dataclasses.replace(result, alternatives=q[alike], search_goal_loss=search_goal_loss)
@@ -121,8 +126,25 @@ def _distinct(
         open_nodes = open_nodes[apart(world, q[open_nodes], q[best]) > DISTINCT]
 
 
+def _straight(
+    robot: Robot, world: World, found: SearchResult, q_start: np.ndarray, q_goal: np.ndarray
+) -> tuple[SearchResult, np.ndarray | None]:
+    """The straight path (2, D) if it is free; the time for the check is added to the search's.
+
+    The exact check judges, which also grants what the covering spheres refuse.
+    """
+    obstacles = obstacle_list(world)
+    exact_model(robot, obstacles)  # built once, and no part of any search
+    started = time.perf_counter()
+    path = np.stack([q_start, q_goal])
+    seen = verify_path(robot, obstacles, path, step=GLANCE)
+    clear = seen.ok and not seen.clearance < world.margin + GRAZE
+    spent_s = time.perf_counter() - started
+    found = dataclasses.replace(found, search_s=found.search_s + spent_s)
+    return found, path if clear else None
+
+
 def _connected(
-    robot: Robot,
     world: World,
     found: SearchResult,
     q_start: np.ndarray,
@@ -130,17 +152,10 @@ def _connected(
     key: jax.Array,
     config: PlannerConfig,
 ) -> tuple[SearchResult, np.ndarray | None]:
-    """A path (P, D), straight or by RRT-Connect, if there is one; its time joins the search's.
+    """A path (P, D) by RRT-Connect, if there is one; its time is added to the search's.
 
     If time is up meanwhile, or the user interrupts, the search has stopped for that.
     """
-    started = time.perf_counter()
-    straight = np.stack([q_start, q_goal])  # the exact check also grants what the spheres refuse
-    seen = verify_path(robot, obstacle_list(world), straight, step=GLANCE)
-    spent_s = time.perf_counter() - started
-    found = dataclasses.replace(found, search_s=found.search_s + spent_s)
-    if seen.ok and not seen.clearance < world.margin:
-        return found, straight
     policy = RRTConnect(lanes=config.lanes)
     tree = policy.forest(jnp.asarray(q_start), jnp.asarray(q_goal), config.capacity)
     stop = make_stop(0.0, max_iterations=config.connect_iterations)

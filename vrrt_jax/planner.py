@@ -23,6 +23,7 @@ from vrrt_jax.splat.types import Camera
 from vrrt_jax.visual import best_probes, forest, plant
 
 PLANTING = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
+ENDED = (Status.TIME_LIMIT, Status.INTERRUPTED)  # before its losses compare with others'
 AGAIN = (Status.NO_MATCH, Status.NO_PATH, Status.NOT_VERIFIED)  # worth another attempt
 RRT_STAR_RADIUS = 1.9  # [rad] nodes of a sparse tree in seven dimensions lie that far apart
 
@@ -77,7 +78,10 @@ def plan(
                 break
             key = jax.random.fold_in(key, PLANTING - again)
             other = _attempt(robot, world, setup, roots, key, rest, on_progress)
-            best = min(result, other, key=lambda r: (not r.ok, r.loss))
+            if other.status in ENDED and not other.ok:
+                best = dataclasses.replace(result, status=other.status)
+            else:
+                best = min(result, other, key=lambda r: (not r.ok, r.loss))
             result = with_time_of(best, result, other)
     return result
 
@@ -133,8 +137,8 @@ def plan_batch(
     """Solve Q problems of one robot, world and camera at once, by an outer ``vmap``.
 
     Problem ``i`` uses the key ``fold_in(key, i)``; each has one attempt. The search times reported
-    are those of the whole batch. On a CPU a loop over :func:`plan` is as fast; on other devices the
-    batch pays.
+    hold the search of the whole batch. On a CPU a loop over :func:`plan` is as fast; on other
+    devices the batch pays.
 
     Args:
         robot: from :func:`load_robot`.
@@ -166,36 +170,35 @@ def plan_batch(
         except ValueError as error:
             raise ValueError(f"problem {i}: {error}") from None
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(starts)))
-    forests, compile_s, plant_s = zip(
-        *(
-            _planted(world, setup, q_start[None], own_key, config)
-            for setup, q_start, own_key in zip(setups, starts, keys, strict=True)
-        ),
-        strict=True,
-    )
-    policies = _stack([setup.policy for setup in setups])
-    found = search(
-        world,
-        policies,
-        _stack(forests),
-        key=keys,
-        stop=_stack([visual_stop(config, setup.goal_loss) for setup in setups]),
-        time_limit_s=config.time_limit_s,
-        batched=True,
-        on_progress=on_progress,
-    )
-    results = []
-    for i, (q_start, setup) in enumerate(zip(starts, setups, strict=True)):
-        own_tree = jax.tree.map(lambda leaf: leaf[i], found.tree)  # noqa: B023 - used at once
-        own = dataclasses.replace(
-            found,
-            tree=own_tree,
-            stopped=found.stopped_each[i],
-            compile_s=found.compile_s + sum(compile_s),
-            search_s=found.search_s + sum(plant_s),
+    with interruptible():
+        forests, compile_s, plant_s = zip(
+            *(
+                _planted(world, setup, q_start[None], own_key, config)
+                for setup, q_start, own_key in zip(setups, starts, keys, strict=True)
+            ),
+            strict=True,
         )
-        ends = (setup.goal_loss, setup.polishing, q_start)
-        results.append(finish_visual(robot, world, own, *ends, keys[i], config))
+        found = search(
+            world,
+            _stack([setup.policy for setup in setups]),
+            _stack(forests),
+            key=keys,
+            stop=_stack([visual_stop(config, setup.goal_loss) for setup in setups]),
+            time_limit_s=time_left(config, sum(plant_s)).time_limit_s,
+            batched=True,
+            on_progress=on_progress,
+        )
+        results = []
+        for i, (q_start, setup) in enumerate(zip(starts, setups, strict=True)):
+            own = dataclasses.replace(
+                found,
+                tree=jax.tree.map(lambda leaf: leaf[i], found.tree),  # noqa: B023 - used at once
+                stopped=found.stopped_each[i],
+                compile_s=found.compile_s + sum(compile_s),
+                search_s=found.search_s + plant_s[i],
+            )
+            ends = (setup.goal_loss, setup.polishing, q_start)
+            results.append(finish_visual(robot, world, own, *ends, keys[i], config))
     return results
 
 

@@ -155,7 +155,6 @@ def _length(world: World, path: np.ndarray) -> float:
 def _reference_length(robot: Robot, world: World, task: Task, key: jax.Array) -> float | None:
     """Of RRT-Connect's shortened path to the true goal, if it finds one."""
     found = planner.plan_to_configuration(robot, world, task.q_start, task.q_goal, key=key)
-    _heed(found.status)
     return _length(world, found.path) if found.ok else None
 
 
@@ -173,7 +172,6 @@ def _cause(attempt: Attempt, *, right: bool, valid: bool, alike: bool, known: bo
 
 def _plan(inputs, key, config: PlannerConfig, masks, guess) -> Attempt:
     result = planner.plan(*inputs, key=key, config=config, mask=masks, q_guess=guess)
-    _heed(result.status)
     times = result.timing
     return Attempt(
         path=result.path if result.status is not Status.NO_PATH else result.target[None],
@@ -183,12 +181,6 @@ def _plan(inputs, key, config: PlannerConfig, masks, guess) -> Attempt:
         loss=result.loss,
         search_s=times["search_s"] + times["shortcut_s"] + times["verify_s"],
     )
-
-
-def _heed(status: Status) -> None:
-    """A task that the user interrupts has no outcome."""
-    if status is Status.INTERRUPTED:
-        raise KeyboardInterrupt
 
 
 def _baseline(inputs, robot_name: str, task: Task, method: str, key, masks) -> Attempt:

@@ -147,7 +147,10 @@ class Status(enum.Enum):
         "no configuration renders like the goal: check the camera and the self-model, "
         "add a view, or raise max_iterations"
     )
-    NO_PATH = "matched, but no way there was found: raise connect_iterations, or move the obstacles"
+    NO_PATH = (
+        "matched, but no way there was found: raise connect_iterations and capacity, or move the "
+        "obstacles"
+    )
     BUDGET = "the iterations ran out: raise max_iterations"
     TREE_FULL = "the tree is full: raise capacity"
     TIME_LIMIT = "the time limit passed: raise time_limit_s"

@@ -45,12 +45,6 @@ class World(Straight):
         return is_free(self, q)
 
 
-def sphere_centres(spheres: Spheres, poses: jax.Array) -> jax.Array:
-    """Centres (n, 3) in the world of spheres on links posed by (L, 4, 4)."""
-    pose = poses[spheres.link]
-    return jnp.einsum("nij,nj->ni", pose[:, :3, :3], spheres.centre) + pose[:, :3, 3]
-
-
 def obstacle_clearance(world: World, q: jax.Array) -> jax.Array:
     """Distance () [m] of the covering spheres at ``q`` (D,) to the nearest obstacle."""
     return _clearance(world, link_poses(world.chain, q))

@@ -71,11 +71,12 @@ def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None =
     found = spheres.spheres_of(model)
     allowed = pairs.excluded(model)
     mesh_source = str(path.resolve())
-    if found.origin == "written":  # they stand for geometry of another file, which this one names
+    name = str(name_or_path) if str(name_or_path) in robot_names() else path.stem
+    if found.origin == "written":  # they stand for the robot of another file, which this one names
         mesh_source, fixed_before = text.source_of(spec)
-        frozen = fixed_before | frozen
+        name, frozen = spec.modelname, fixed_before | frozen
     fields = {
-        "name": str(name_or_path) if str(name_or_path) in robot_names() else path.stem,
+        "name": name,
         "mesh_source": mesh_source,
         "frozen": frozen,
     }

@@ -52,8 +52,6 @@ class MeshRenderer:
                 rgba=obstacle.rgba,
                 group=OBSTACLE_GROUP,
             )
-        for light in list(spec.lights):
-            spec.delete(light)
         headlight = spec.visual.headlight
         headlight.ambient, headlight.diffuse = [0.35 * light] * 3, [0.6 * light] * 3
         headlight.specular = [0.02] * 3
