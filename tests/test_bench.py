@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import signal
 
 import jax
 import jax.numpy as jnp
@@ -244,6 +245,33 @@ def test_dr_robot_is_a_plain_adam_chain(near_task):
         q = jnp.clip(optax.apply_updates(q, updates), world.lower, world.upper)
     np.testing.assert_allclose(found.path, np.stack(path)[: len(found.path)], atol=2e-2)
     assert found.loss <= float(policy.loss(world, jnp.asarray(near_task.q_start)))
+
+
+def test_rrt_star_arrives_where_joints_wrap():
+    robot, world = tasks.bench_robot("fetch"), tasks.bench_world("fetch", "")
+    joint = int(np.flatnonzero(robot.wraps)[-1])
+    path = np.stack([robot.home, robot.home]).astype(np.float32)
+    path[:, joint] = 3.0, -3.0
+    estimate = baselines.BaselineResult(
+        path=path, loss=0.0, goal_loss=1.0, found_path=True, search_s=0.0
+    )
+    found = baselines.rrt_star_to_estimate(
+        robot, world, estimate, key=jax.random.key(0), iterations=3
+    )
+    assert found.found_path
+    assert found.path[-1, joint] == pytest.approx(2 * np.pi - 3.0, abs=1e-3)
+
+
+def test_an_interrupted_task_is_not_recorded(tmp_path, monkeypatch):
+    def interrupted(*args, **kwargs):
+        signal.raise_signal(signal.SIGINT)  # as the planner's blocks see it: a flag
+        return {"success": False}
+
+    file = tmp_path / "results.json"
+    monkeypatch.setattr(runner, "solve", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        runner.run(_benchmark(), file)
+    assert json.loads(file.read_text())["tasks"] == []
 
 
 def test_classifier_learns_the_scene(monkeypatch):

@@ -163,6 +163,17 @@ def test_the_shortest_drive_has_no_shortcuts():
     np.testing.assert_array_equal(shortcut(world, path, key=jax.random.key(0)), path)
 
 
+def test_headings_of_a_trajectory_go_on(snake, home):
+    world = nrp_jax.build_world(snake, home)
+    wraps = np.asarray(world.wraps)
+    assert wraps.any()
+    ends = np.stack([START, START]).astype(np.float32)
+    ends[:, wraps] = np.array([[3.0], [-3.0]])
+    trajectory = trajectory_of(world, ends)
+    assert np.abs(np.diff(trajectory, axis=0)).max() <= 0.02 + 1e-5
+    np.testing.assert_allclose(trajectory[-1, wraps], 2 * np.pi - 3.0, atol=1e-5)
+
+
 def test_verification_sees_what_is_wrong(snake, home, scene, solve):
     world = nrp_jax.build_world(snake, home)
     limits = {"lower": np.asarray(world.lower), "upper": np.asarray(world.upper)}

@@ -5,6 +5,7 @@ problems, whose images are MuJoCo's, are planned in test_cli.py.
 """
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -352,6 +353,16 @@ def _hand_position(panda, q):
     return np.asarray(vrrt_jax.link_poses(panda.chain, jnp.asarray(q)))[-1, :3, 3].tolist()
 
 
+def finished(tree):
+    return searches.SearchResult(
+        tree=tree,
+        stopped=searches.Stopped.REACHED,
+        history=np.zeros((1, 4)),
+        compile_s=0.0,
+        search_s=0.0,
+    )
+
+
 def test_ambiguous_goals_are_told(panda, self_model, camera, open_world):
     """With a slack bar, the hand after half a turn matches too: both ends are named."""
     image = picture(panda, self_model, camera, Q_GOAL, level=2)
@@ -360,13 +371,7 @@ def test_ambiguous_goals_are_told(panda, self_model, camera, open_world):
     roots = jnp.asarray(np.stack([Q_START, Q_GOAL, HALF_TURNED]))
     score, payload = setup.policy.roots(open_world, roots)
     tree = trees.create(roots, score, payload, config.capacity)
-    found = searches.SearchResult(
-        tree=tree,
-        stopped=searches.Stopped.REACHED,
-        history=np.zeros((1, 4)),
-        compile_s=0.0,
-        search_s=0.0,
-    )
+    found = finished(tree)
     ends = (setup.goal_loss, setup.polishing, Q_START)
     result = finish.finish_visual(panda, open_world, found, *ends, jax.random.key(0), config)
     assert result.ok
@@ -392,32 +397,54 @@ SLIDER = """
 """
 
 
-@pytest.mark.parametrize("margin, granted", [(0.0, True), (0.001, False)])
-def test_a_straight_way_that_only_the_spheres_refuse(tmp_path, margin, granted):
-    path = tmp_path / "slider.xml"
+@pytest.fixture(scope="module")
+def slider(tmp_path_factory):
+    path = tmp_path_factory.mktemp("robots") / "slider.xml"
     path.write_text(SLIDER)
-    robot = vrrt_jax.load_robot(path)
-    near = vrrt_jax.Obstacle(
-        name="near", kind="box", position=(0.0, 0.1525, 0.0), size=(0.05, 0.05, 0.05)
-    )
-    world = vrrt_jax.build_world(robot, [near], margin=margin)
+    return vrrt_jax.load_robot(path)
+
+
+def beside(y):
+    """A box that leaves ``y`` - 0.15 m to the slider that passes it."""
+    return vrrt_jax.Obstacle(name="box", kind="box", position=(0, y, 0), size=(0.05, 0.05, 0.05))
+
+
+@pytest.mark.parametrize("margin, granted", [(0.0, True), (0.001, False)])
+def test_a_straight_way_that_only_the_spheres_refuse(slider, margin, granted):
+    world = vrrt_jax.build_world(slider, [beside(0.1525)], margin=margin)
     ends = np.array([[-0.5], [0.5]], np.float32)
-    found = searches.SearchResult(
-        tree=trees.create(jnp.asarray(ends), jnp.zeros(2), None, 8),
-        stopped=searches.Stopped.CONVERGED,
-        history=np.zeros((1, 4)),
-        compile_s=0.0,
-        search_s=0.0,
-    )
     steps = int(free_steps(world, jnp.asarray(ends[:1]), jnp.asarray(ends[1:]), 64)[0])
     assert 0 < steps < 64
-    _, way = finish._straight(robot, world, found, *ends)
+    found = finished(trees.create(jnp.asarray(ends), jnp.zeros(2), None, 8))
+    _, way = finish._straight(slider, world, found, *ends)
     assert (way is not None) == granted
     if granted:
         np.testing.assert_array_equal(way, ends)
 
 
-def test_another_attempt_while_nothing_matches(panda, self_model, camera, image, open_world):
+def test_a_match_without_a_way_is_told(slider, monkeypatch):
+    """What can be reached but does not match is no substitute for it."""
+    world = vrrt_jax.build_world(slider, [beside(0.1)])
+    q = np.array([[-0.4], [0.5]], np.float32)
+    polished = (q, np.array([2.0, 0.5]), np.array([2.0, 0.5]))
+    monkeypatch.setattr(finish, "_polished", lambda found, *_: (found, polished))
+    found = finished(trees.create(jnp.asarray(q), jnp.ones(2), None, 8))
+    config = planner.PlannerConfig(lanes=4, capacity=64, connect_iterations=5)
+    polishing = types.SimpleNamespace(goal_loss=1.0)
+    start = np.array([-0.5], np.float32)
+    key = jax.random.key(0)
+    args: tuple = (slider, world, found, 1.0, polishing, start, key, config)
+    result = finish.finish_visual(*args)
+    assert result.status is vrrt_jax.Status.NO_PATH and result.target == q[1]
+    assert len(result.alternatives) == 0
+    monkeypatch.setattr(finish, "_polished", lambda found, *_: (found, (q, *[np.ones(2)] * 2)))
+    result = finish.finish_visual(*args)
+    assert result.ok and result.target == q[0]
+
+
+def test_another_attempt_while_nothing_matches(
+    panda, self_model, camera, image, open_world, monkeypatch
+):
     config = dataclasses.replace(QUICK, patience=1, match_scale=1e-6, hypotheses=0)
     args = (panda, open_world, self_model, camera, image, Q_START)
     results, begun = [], []
@@ -437,6 +464,12 @@ def test_another_attempt_while_nothing_matches(panda, self_model, camera, image,
     assert results[1].loss <= results[0].loss
     spent = finish.with_time_of(results[0], *results).timing["search_s"]
     assert spent == results[0].timing["search_s"] + results[1].timing["search_s"]
+
+    ended = dataclasses.replace(results[1], status=vrrt_jax.Status.INTERRUPTED, loss=0.0)
+    attempts = iter([results[0], ended])  # whose losses are of other images
+    monkeypatch.setattr(planner, "_attempt", lambda *_: next(attempts))
+    result = vrrt_jax.plan(*args, key=jax.random.key(0), config=config)
+    assert result.status is vrrt_jax.Status.INTERRUPTED and result.loss == results[0].loss
 
 
 def test_a_guess_becomes_a_root(panda, self_model, camera, image, open_world):
