@@ -80,7 +80,7 @@ def run(benchmark: Benchmark, file: str | Path | None, *, jobs: int = 1) -> dict
         ValueError: the file holds another benchmark, version or seed.
         OSError: the file cannot be written; what it held stays.
     """
-    results = _resume(benchmark, Path(file)) if file is not None else _fresh(benchmark)
+    results = _fresh(benchmark, jobs) if file is None else _resume(benchmark, Path(file), jobs)
     done = {_key(row) for row in results["tasks"]}
     todo = [
         (variant.name, level, index)
@@ -152,13 +152,15 @@ def _key(row: dict[str, Any]) -> tuple[str, float, int]:
     return row["variant"], row["level"], row["index"]
 
 
-def _fresh(benchmark: Benchmark) -> dict[str, Any]:
-    return {**benchmark.header(), "machine": machine(), "tasks": []}
+def _fresh(benchmark: Benchmark, jobs: int) -> dict[str, Any]:
+    here = machine()
+    here["cores"] = max(1, int(here["cores"]) // jobs)  # that a task has
+    return {**benchmark.header(), "machine": here, "tasks": []}
 
 
-def _resume(benchmark: Benchmark, file: Path) -> dict[str, Any]:
+def _resume(benchmark: Benchmark, file: Path, jobs: int) -> dict[str, Any]:
     if not file.exists():
-        results = _fresh(benchmark)
+        results = _fresh(benchmark, jobs)
         _write(file, results)  # a bad path is told before hours of work
         return results
     try:

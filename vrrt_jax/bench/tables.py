@@ -81,7 +81,7 @@ def write_page(files: Sequence[Path], folder: Path) -> Path:
         parts += [f"## {what}: {robot}", ""]
         for results in group:
             on = results.get("machine")  # older files do not tell
-            where = f" on {on['cores']} cores of {on['processor']}" if on else ""
+            where = f", cores a task: {on['cores']} of {on['processor']}" if on else ""
             seen = results.get("self_model")
             seen = f"self-model {seen}" if seen else "an earlier self-model"
             parts += [f"`{_command(results)}`{where}, {seen}", "", to_text(results), ""]
