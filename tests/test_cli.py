@@ -98,6 +98,7 @@ def test_bad_input_is_one_clear_line_and_writes_nothing(tmp_path, problem_copy, 
     expect("no problem at 'nowhere'; packaged ones: ", "--problem", "nowhere")
     expect("missing --world", "--robot", "panda")
     expect("not both", "--problem", folder, "--robot", "panda")
+    expect("--problem or --self-model", "--problem", folder, "--self-model", "arm.npz")
     expect("capacity=0", "--problem", folder, "--capacity", 0)
     expect("time_limit_s=-1", "--problem", folder, "--time-limit", -1)
     outside = [3.0, *fields["start"][1:]]

@@ -78,7 +78,19 @@ def test_a_small_self_model_is_trained_and_resumed(arm, tmp_path, monkeypatch):
         fit.fit_self_model(robot, spec, path, seed=0, config=CONFIG)
     with pytest.raises(ValueError, match="unfinished training of another robot, seed"):
         fit.fit_self_model(robot, spec, path, seed=1, config=CONFIG)
+    other = dataclasses.replace(robot, xml=robot.xml + " ")
+    with pytest.raises(ValueError, match="unfinished training of another robot"):
+        fit.fit_self_model(other, spec, path, seed=0, config=CONFIG)
+
+    restored, rendered = [], []
+    restore, render_images = fit._restore, fit.render_images
+    monkeypatch.setattr(fit, "_restore", lambda *a: restored.append(a[0].name) or restore(*a))
+    monkeypatch.setattr(
+        fit, "render_images", lambda *a, **k: rendered.append(k) or render_images(*a, **k)
+    )
     model = fit.fit_self_model(robot, spec, path, seed=0, config=CONFIG)
+    assert len(restored) == 1  # the level that was done
+    assert all(k["tip"] is not None for k in rendered) and rendered  # of close-ups alone
     assert not path.with_name("arm.npz.work").exists()
     assert model.levels[0].psnr_db > 22 and model.close_up.psnr_db > 18
     assert load_self_model(path).close_up.match_bar == model.close_up.match_bar

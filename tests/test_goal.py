@@ -41,6 +41,20 @@ def test_plain_background_becomes_a_mask(camera, image):
     np.testing.assert_allclose(goal.rgb[0], image[..., :3], atol=3e-3)
 
 
+def test_an_opaque_fourth_channel_is_no_mask(camera, image):
+    flat = image[..., :3] * image[..., 3:] + 0.5 * (1 - image[..., 3:])
+    opaque = np.concatenate([flat, np.ones((60, 80, 1))], axis=-1)
+    goal, _ = prepare_goal([opaque], [camera], 60)
+    np.testing.assert_allclose(goal.coverage[0], image[..., 3])
+
+
+def test_a_mask_of_bytes_is_one_of_truths(camera, image):
+    mask = np.full((60, 80), 255, np.uint8)
+    mask[:, 40:] = 0
+    goal, _ = prepare_goal([image], [camera], 30, [mask])
+    assert np.unique(goal.valid).tolist() == [0.0, 1.0]
+
+
 def test_masked_pixels_do_not_count(camera, image):
     mask = np.ones((60, 80), bool)
     mask[:, 40:] = False
@@ -89,6 +103,8 @@ def broken(image, what):
         image[..., :3] *= 255
     if what == "mask":
         image[..., 3] = 0
+    if what == "cluttered":
+        return np.random.default_rng(0).random((60, 80, 3))
     if what == "blank":
         return np.full((60, 80, 3), 0.7)
     return image
@@ -104,6 +120,7 @@ def broken(image, what):
         ("range", r"expected floats in \[0, 1\]"),
         ("mask", "mask .* is empty"),
         ("blank", "is blank"),
+        ("cluttered", "100 % of the goal image differ .* expected a plain background"),
     ],
 )
 def test_bad_images_are_explained(camera, image, what, message):
@@ -153,3 +170,17 @@ def test_a_part_of_a_goal_is_what_its_camera_sees(camera, image):
     )
     whole, _ = cut_goal(goal, cameras, np.array([[0.0, 0.0], [0.0, 0.0]]), 500)
     assert whole.coverage.shape == (2, 60, 80)
+
+
+def test_levels_serve_about_their_size(panda):
+    model = vrrt_jax.load_self_model(vrrt_jax.problems.self_model_path(panda))
+    sizes = [level.size_px for level in model.levels]
+    assert [model.level_for(size).size_px for size in sizes] == sizes
+    assert [model.level_for(size + size // 16).size_px for size in sizes] == sizes  # as of 720 px
+    assert model.level_for(sizes[0] + sizes[0] // 4).size_px == sizes[1]
+
+
+def test_a_folder_of_the_same_name_does_not_hide_a_problem(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "panda_posts").mkdir()
+    assert vrrt_jax.load_problem("panda_posts").robot.name == "panda"

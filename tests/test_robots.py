@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from vrrt_jax.core.kinematics import link_poses
+from vrrt_jax.core.kinematics import body_links, link_poses
 from vrrt_jax.robots import load_robot, paths, sources
 
 POSE_TOLERANCE = 1e-5  # float32 over seven joints; worst seen 6e-7
@@ -303,6 +303,47 @@ def test_written_model_loads_as_the_same_robot(tmp_path):
     np.testing.assert_array_equal(again.cover.radius, robot.cover.radius)
     np.testing.assert_array_equal(again.pairs, robot.pairs)
     assert again.allowed == robot.allowed
+
+
+def test_bodies_with_several_joints_belong_to_the_last(tmp_path):
+    robot = load_robot(write(tmp_path, ARM))
+    spec = sources.mesh_spec(robot)
+    assert spec is not None
+    model = spec.compile()
+    link = dict(
+        zip((model.body(k).name for k in range(model.nbody)), body_links(model), strict=True)
+    )
+    assert link == {"world": 0, "base": 0, "upper": 1, "fore": 3, "rod": 4}
+
+
+def test_visuals_of_a_urdf_are_drawn(tmp_path):
+    look = '<visual><geometry><sphere radius="0.09"/></geometry></visual>'
+    robot = load_robot(
+        write(
+            tmp_path,
+            URDF.replace('<link name="claw"/>', f'<link name="claw">{look}</link>').replace(
+                '<link name="arm">', f'<link name="arm">{look}'
+            ),
+            "two.urdf",
+        )
+    )
+    spec = sources.mesh_spec(robot)
+    assert spec is not None
+    drawn = {}
+    for body in spec.bodies:
+        drawn[body.name] = [g.type.name for g in body.geoms if g.group < 3]
+    assert drawn["arm"] == drawn["claw"] == ["mjGEOM_SPHERE"]
+    assert drawn["tip"] == ["mjGEOM_BOX"]
+    model, plain = spec.compile(), sources.mesh_spec(robot, visuals=False).compile()
+    assert np.sum(model.geom_contype > 0) == plain.ngeom == 3
+
+    mesh = '<visual><geometry><mesh filename="none.dae"/></geometry></visual>'
+    robot = load_robot(
+        write(tmp_path, URDF.replace('<link name="arm">', f'<link name="arm">{mesh}'), "dae.urdf")
+    )
+    with pytest.warns(UserWarning, match="collision shapes are drawn instead"):
+        spec = sources.mesh_spec(robot)
+    assert spec is not None and spec.compile().ngeom == 3
 
 
 def test_coupled_joints_are_fixed_with_a_warning(tmp_path):

@@ -143,6 +143,14 @@ def test_wrapping_joint_takes_the_short_way(pendulum):
     assert verify_path(pendulum, [ahead], path + 2 * np.pi).ok
 
 
+@pytest.mark.parametrize("turn", [np.pi, np.float32(np.pi), -np.pi, -np.float32(np.pi)])
+def test_half_a_turn_goes_the_way_it_is_written(pendulum, turn):
+    for side in (1.0, -1.0):
+        box = Obstacle(name="box", kind="box", position=(0, 0.3 * side, 1), size=(0.05, 0.05, 0.05))
+        found = verify_path(pendulum, [box], np.array([[0.0], [turn]]))
+        assert found.ok == (side != np.sign(turn))
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [

@@ -191,8 +191,10 @@ def _problem(arguments: argparse.Namespace):
     parts = ("robot", "world", "goal", "camera", "start")
     given = [name for name in parts if getattr(arguments, name) is not None]
     if arguments.problem is not None:
+        given += [name for name in ("self_model", "freeze") if getattr(arguments, name) is not None]
         if given:
-            raise ValueError(f"give either --problem or --{', --'.join(given)}, not both")
+            options = ", --".join(given).replace("_", "-")
+            raise ValueError(f"give either --problem or --{options}, not both")
         return problems.load_problem(arguments.problem)
     missing = [name for name in parts if name not in given]
     if missing:

@@ -233,16 +233,17 @@ def finish(
     shortcut(world, raw_path, key=key, rounds=0)
     shortcut_compile_s = time.perf_counter() - started
     started = time.perf_counter()
-    path = np.array(shortcut(world, raw_path, key=key, rounds=config.shortcut_rounds))
+    path = _going_on(robot, shortcut(world, raw_path, key=key, rounds=config.shortcut_rounds))
     shortcut_s = time.perf_counter() - started
 
     started = time.perf_counter()
     obstacles = obstacle_list(world)
     verification = verify_path(robot, obstacles, path, step=config.verify_step)
     if not verification.ok:
-        raw = verify_path(robot, obstacles, raw_path, step=config.verify_step)
+        longer = _going_on(robot, raw_path)
+        raw = verify_path(robot, obstacles, longer, step=config.verify_step)
         if raw.ok:
-            path, verification = np.array(raw_path), raw
+            path, verification = longer, raw
     verify_s = time.perf_counter() - started
 
     if has_path and loss <= goal_loss and verification.ok:
@@ -255,8 +256,6 @@ def finish(
         status = STATUS_OF.get(found.stopped, Status.NO_MATCH)
     else:
         status = Status.NOT_VERIFIED
-    # Joints that wrap go on from waypoint to waypoint, so that a controller may interpolate.
-    path[:, robot.wraps] = np.unwrap(path[:, robot.wraps], axis=0)
     rejected = np.asarray(found.tree.rejected)
     return PlanResult(
         status=status,
@@ -280,3 +279,10 @@ def finish(
         history=found.history,
         tree=found.tree,
     )
+
+
+def _going_on(robot: Robot, path: np.ndarray) -> np.ndarray:
+    """The path (P, D) with joints that wrap going on, so that a controller may interpolate."""
+    path = np.array(path)
+    path[:, robot.wraps] = np.unwrap(path[:, robot.wraps], axis=0)
+    return path

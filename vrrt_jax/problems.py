@@ -44,7 +44,7 @@ def load_problem(name_or_path: str | Path) -> Problem:
         ValueError: a file is damaged or a field is missing.
     """
     folder = Path(name_or_path)
-    if not folder.is_dir() and str(name_or_path) in problem_names():
+    if not (folder / "problem.json").is_file() and str(name_or_path) in problem_names():
         folder = scenes_dir() / "problems" / str(name_or_path)
     file = folder / "problem.json"
     if not file.is_file():
@@ -66,7 +66,7 @@ def load_problem(name_or_path: str | Path) -> Problem:
         return Problem(
             name=folder.resolve().name,
             robot=robot,
-            world=load_world(folder / fields["world"], robot),
+            world=load_world(_beside(folder, fields["world"]), robot),
             self_model=load_self_model(self_model_path(robot, self_model)),
             cameras=cameras,
             goal_images=images,

@@ -89,6 +89,15 @@ def place(matrix: jax.Array, poses: jax.Array) -> jax.Array:
     return (poses[:, :3].reshape(-1) @ matrix).reshape(3, -1)
 
 
+def body_links(model: mujoco.MjModel) -> np.ndarray:
+    """The link (nbody,) that every body belongs to: that of its last joint, or its parent's."""
+    link = np.zeros(model.nbody, int)
+    for body in range(1, model.nbody):
+        first, count = model.body_jntadr[body], model.body_jntnum[body]
+        link[body] = first + count if count else link[model.body_parentid[body]]
+    return link
+
+
 def chain_from_model(model: mujoco.MjModel) -> tuple[Chain, np.ndarray, np.ndarray]:
     """Read the chain from a model with hinge and slide joints on a fixed base.
 
@@ -105,7 +114,7 @@ def chain_from_model(model: mujoco.MjModel) -> tuple[Chain, np.ndarray, np.ndarr
     num_joints = model.njnt
     terms = np.zeros((4, num_joints, 4, 4))
     parents = [0] * num_joints
-    body_link = np.zeros(model.nbody, int)
+    body_link = body_links(model)
     body_in_link = np.tile(np.eye(4), (model.nbody, 1, 1))
     for body in range(1, model.nbody):
         parent = model.body_parentid[body]
@@ -113,7 +122,7 @@ def chain_from_model(model: mujoco.MjModel) -> tuple[Chain, np.ndarray, np.ndarr
         offset = body_in_link[parent] @ body_in_parent
         first, count = model.body_jntadr[body], model.body_jntnum[body]
         if count == 0:
-            body_link[body], body_in_link[body] = body_link[parent], offset
+            body_in_link[body] = offset
             continue
         if count > 1:
             raise ValueError(
@@ -122,7 +131,6 @@ def chain_from_model(model: mujoco.MjModel) -> tuple[Chain, np.ndarray, np.ndarr
             )
         terms[:, first] = _joint_terms(model, first, offset)
         parents[first] = int(body_link[parent])
-        body_link[body] = first + 1
     arrays = [jnp.asarray(t, jnp.float32) for t in terms]
     chain = Chain(
         constant=arrays[0],

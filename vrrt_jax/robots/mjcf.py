@@ -3,30 +3,71 @@
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
 _TOOL = "tool_"  # two models may use a name twice
+_SEEN, _HIDDEN = 1, 3  # groups of geoms: drawn, and not
 _UNPLANNED = {
     int(mujoco.mjtJoint.mjJNT_FREE): "free",
     int(mujoco.mjtJoint.mjJNT_BALL): "ball",
 }
 
 
-def read_spec(path: Path) -> mujoco.MjSpec:
+def read_spec(path: Path, *, visuals: bool = False) -> mujoco.MjSpec:
     """Parse an MJCF or URDF file into an editable spec.
 
     Args:
         path: an existing file.
+        visuals: keep what a URDF has for the eye, and hide what collides in its stead.
 
     Raises:
         ValueError: the file is not readable as a robot.
     """
+    if visuals:
+        try:
+            if spec := _urdf_with_visuals(path):
+                return spec
+        except ValueError as error:
+            warnings.warn(
+                f"{_unreadable(path, error)}; its collision shapes are drawn instead of its visual "
+                "ones",
+                stacklevel=3,
+            )
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
+        return _plain(mujoco.MjSpec.from_file(str(path)))
     except ValueError as error:
         raise ValueError(_unreadable(path, error)) from None
+
+
+def _urdf_with_visuals(path: Path) -> mujoco.MjSpec | None:
+    """A URDF with the geoms that MuJoCo leaves out by default; None for another file."""
+    try:
+        root = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError:
+        return None
+    if root.tag != "robot":
+        return None
+    compiler = root
+    for tag in ("mujoco", "compiler"):
+        found = compiler.find(tag)
+        compiler = ElementTree.SubElement(compiler, tag) if found is None else found
+    compiler.set("discardvisual", "false")
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+    spec.modelfiledir = str(path.resolve().parent)
+    spec = _plain(spec)
+    for body in spec.bodies:
+        if any(not (geom.contype or geom.conaffinity) for geom in body.geoms):
+            for geom in body.geoms:
+                geom.group = _HIDDEN if geom.contype or geom.conaffinity else _SEEN
+    spec.copy().compile()  # the formats of many meshes are not read
+    return spec
+
+
+def _plain(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """The same with all bodies and joints named, and fit to compile for kinematics."""
     spec.option.disableflags = 0  # a file may switch contacts off
     # A URDF fuses links without a joint of their own into their parents: their names would be lost.
     spec.compiler.fusestatic = False

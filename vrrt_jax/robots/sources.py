@@ -103,7 +103,7 @@ def mesh_spec(robot: "Robot", *, visuals: bool = True) -> mujoco.MjSpec | None:
     path = mesh_file(robot.mesh_source)
     if path is None:
         return None
-    spec = mjcf.read_spec(path)
+    spec = mjcf.read_spec(path, visuals=visuals)
     source = _SOURCES.get(str(robot.mesh_source))
     fixed = source.freeze if source else {}
     if source and source.root:

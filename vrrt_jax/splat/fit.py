@@ -6,6 +6,7 @@ is for a close-up of the outermost link, a hand or a tool, whose turn a whole im
 """
 
 import dataclasses
+import hashlib
 import json
 import time
 from pathlib import Path
@@ -20,9 +21,10 @@ from scipy.cluster.vq import kmeans2
 from tqdm import tqdm
 
 from vrrt_jax.core.files import replacing
-from vrrt_jax.core.kinematics import chain_from_model, link_poses
+from vrrt_jax.core.kinematics import body_links, link_poses
 from vrrt_jax.core.world import batch_is_free, build_world
 from vrrt_jax.robots.robot import workspace
+from vrrt_jax.robots.sources import mesh_file
 from vrrt_jax.splat.camera import cut, orbit, project, shrunk, stack_cameras
 from vrrt_jax.splat.loss import image_loss, psnr_db
 from vrrt_jax.splat.model import Level, SelfModel, save_self_model
@@ -132,8 +134,16 @@ def fit_self_model(robot, spec: mujoco.MjSpec, path: str | Path, *, seed: int, c
 
 def _claim(work: Path, robot, seed: int, config: FitConfig) -> None:
     """Make the work folder ours, or see that it was already."""
+    source = mesh_file(robot.mesh_source)
+    what = robot.xml.encode() + (source.read_bytes() if source else b"")
     stamp = json.dumps(
-        {"robot": robot.name, "seed": seed, "config": dataclasses.asdict(config)}, sort_keys=True
+        {
+            "robot": robot.name,
+            "content": hashlib.sha256(what).hexdigest(),
+            "seed": seed,
+            "config": dataclasses.asdict(config),
+        },
+        sort_keys=True,
     )
     work.mkdir(parents=True, exist_ok=True)
     file = work / "training.json"
@@ -212,7 +222,7 @@ def render_images(
         The images; points (m, 7): link, position in the link's frame [m], colour.
     """
     renderer = MeshRenderer(spec)
-    _, body_link, _ = chain_from_model(renderer.model)
+    body_link = body_links(renderer.model)
     rng = np.random.default_rng(seed)
     q = random_configurations(robot, num, rng)
     centre, radius = workspace(robot)

@@ -12,6 +12,8 @@ from vrrt_jax.splat.camera import cut, shrunk, stack_cameras
 from vrrt_jax.splat.types import Camera, GoalImage
 
 BACKGROUND_TOLERANCE = 0.06  # colour difference that still counts as background
+OPAQUE = 0.99  # a fourth channel that is nowhere less is no mask
+MOST = 0.9  # of an image on a plain background can be robot
 KNOWN = 0.75  # share of a shrunk pixel that has to be valid, for its mean to stand for all of it
 
 
@@ -56,8 +58,8 @@ def prepare_goal(
 
     Args:
         images: V arrays (H, W, 3) or (H, W, 4), uint8 or float in [0, 1]. The fourth channel is the
-            robot's coverage; without it, whatever differs from the colour that prevails on the
-            border is taken to be robot.
+            robot's coverage; without it, or where all of it is opaque, whatever differs from the
+            colour that prevails on the border is taken to be robot.
         cameras: V cameras of the images' sizes.
         image_px: wanted height; the images are reduced by the nearest whole factor.
         masks: (H, W) bool, False where a pixel is unknown or occluded.
@@ -151,7 +153,7 @@ def _checked(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]
             f"the goal image's values go from {image.min():.3g} to {image.max():.3g}; expected "
             "floats in [0, 1] or uint8"
         )
-    if image.shape[2] == 4:
+    if image.shape[2] == 4 and image[..., 3].min() < OPAQUE:
         coverage = image[..., 3]
         if coverage.mean() < 1e-4:
             raise ValueError(
@@ -160,12 +162,17 @@ def _checked(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]
             )
     else:
         border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
-        apart = np.abs(image - np.median(border, axis=0)).max(axis=-1)
+        apart = np.abs(image - np.median(border, axis=0))[..., :3].max(axis=-1)
         coverage = (apart > BACKGROUND_TOLERANCE).astype(np.float32)
         if coverage.mean() < 1e-4:
             raise ValueError(
                 "the goal image is blank: every pixel has the colour of the border; give an "
                 "image that shows the robot"
+            )
+        if coverage.mean() > MOST:
+            raise ValueError(
+                f"{100 * coverage.mean():.0f} % of the goal image differ from the colour of its "
+                "border; expected a plain background, or the robot's mask as fourth channel"
             )
     return image[..., :3] * coverage[..., None], coverage
 
@@ -179,7 +186,7 @@ def _checked_mask(mask: np.ndarray, camera: Camera) -> np.ndarray:
         )
     if not mask.any():
         raise ValueError("the mask hides every pixel; True marks the pixels to compare")
-    return mask.astype(np.float32)
+    return mask.astype(bool).astype(np.float32)
 
 
 def _blocks(image: np.ndarray, factor: int) -> np.ndarray:

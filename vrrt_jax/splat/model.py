@@ -14,6 +14,7 @@ from vrrt_jax.splat.types import SplatModel
 
 FORMAT = 3
 CLOSE_UP = "close_up"
+NEARLY = 1.125  # a level serves images so many times as high as those it was trained for
 ARRAYS = ("mean", "radius", "density", "rgb", "shade", "link", "tau")
 
 
@@ -39,8 +40,8 @@ class SelfModel:
     info: dict[str, Any]  # how it was trained: numbers of images, steps, seconds, versions
 
     def level_for(self, height_px: int) -> Level:
-        """The coarsest level trained for images at least this high, or the finest."""
-        fitting = [level for level in self.levels if level.size_px >= height_px]
+        """The coarsest level trained for images about this high or higher, or the finest."""
+        fitting = [level for level in self.levels if NEARLY * level.size_px >= height_px]
         return fitting[0] if fitting else self.levels[-1]
 
 

@@ -142,7 +142,7 @@ class MeshRenderer:
         if size not in self._renderers:
             try:
                 self._renderers[size] = mujoco.Renderer(self.model, *size)
-            except (RuntimeError, mujoco.FatalError) as error:
+            except (ImportError, RuntimeError, mujoco.FatalError) as error:
                 raise RuntimeError(
                     "OpenGL is not available for rendering meshes "
                     f"({error}); install libosmesa6 (or libegl1 and libgl1), or set MUJOCO_GL"
