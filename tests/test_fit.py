@@ -89,8 +89,7 @@ def test_a_small_self_model_is_trained_and_resumed(arm, tmp_path, monkeypatch):
         fit, "render_images", lambda *a, **k: rendered.append(k) or render_images(*a, **k)
     )
     model = fit.fit_self_model(robot, spec, path, seed=0, config=CONFIG)
-    assert len(restored) == 1  # the level that was done
-    assert all(k["tip"] is not None for k in rendered) and rendered  # of close-ups alone
+    assert len(restored) == 1 and not rendered  # the level and the images that were done
     assert not path.with_name("arm.npz.work").exists()
     assert model.levels[0].psnr_db > 22 and model.close_up.psnr_db > 18
     assert load_self_model(path).close_up.match_bar == model.close_up.match_bar
