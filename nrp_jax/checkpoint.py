@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -72,13 +73,13 @@ def load_model(path: str | Path) -> Model:
             }
         given = description["config"].items()
         fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given}
-        config = ModelConfig(**fields)
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile):
+        config, info = ModelConfig(**fields), description["info"]
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error):
         raise ValueError(
             f"'{path}' is not a readable model of this version; train it again with: nrp train"
         ) from None
     variables = flax.traverse_util.unflatten_dict(flat, sep="/")
-    return Model(config=config, variables=variables, info=description["info"])
+    return Model(config=config, variables=variables, info=info)
 
 
 def check_model(model: Model, path: str | Path, **expected: str) -> None:

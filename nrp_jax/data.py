@@ -19,7 +19,7 @@ import numpy as np
 
 from nrp_jax import houses
 from nrp_jax.grid import Grid
-from vrrt_jax.core.command import end_with_parent
+from vrrt_jax.core.command import end_with_parent, usable_cores
 from vrrt_jax.core.files import UNFINISHED, replacing
 
 VERSION = 4  # of the rows
@@ -308,7 +308,7 @@ def add_arguments(subparsers) -> None:
     parser.add_argument("--waypoints", type=int, default=Settings.waypoints, help="of a query")
     parser.add_argument("--nodes", type=int, default=Settings.nodes, help="of a roadmap")
     parser.add_argument("--seed", type=int, default=0, help="of homes, roadmaps and rows")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes")
 
 
 def _run_command(arguments: argparse.Namespace) -> int:

@@ -175,8 +175,10 @@ def _read_npz(path: Path) -> Grid:
     if "occupied" not in arrays:
         raise ValueError(f"it has no array 'occupied', only: {', '.join(arrays)}")
     origin = tuple(np.ravel(arrays.get("origin_m", np.zeros(3))).tolist())
-    resolution = float(arrays.get("resolution_m", RESOLUTION))
-    return Grid(occupied=arrays["occupied"], resolution=resolution, origin=origin)
+    resolution = np.ravel(arrays.get("resolution_m", RESOLUTION))
+    if len(resolution) != 1:
+        raise ValueError(f"its resolution_m is {resolution.tolist()}; expected one number")
+    return Grid(occupied=arrays["occupied"], resolution=float(resolution[0]), origin=origin)
 
 
 def _read_ros(path: Path) -> Grid:

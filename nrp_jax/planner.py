@@ -20,7 +20,7 @@ from nrp_jax.world import GridWorld, batch_is_free, build_world
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import into_limits
 from vrrt_jax.core.rrt import RRTConnect, connection_path, tree_path
-from vrrt_jax.core.search import SearchResult, Stopped, make_stop, search
+from vrrt_jax.core.search import SearchResult, Stopped, interruptible, make_stop, search
 from vrrt_jax.core.shortcut import padded, path_length, shortcut
 from vrrt_jax.core.types import Rejection, Tree
 
@@ -65,7 +65,9 @@ class PlanResult:
     expansions: int  # lanes tried, in all attempts
     rejected: Mapping[str, int]  # lanes lost, by reason
     timing: Mapping[str, float]  # compile_s, search_s, shortcut_s, verify_s
-    history: np.ndarray  # (chunks + 1, 4): iteration, seconds, distance to the goal, nodes
+    # (chunks + 1, 4): iteration, seconds, distance to the goal (of rrt-connect: between its trees),
+    # nodes
+    history: np.ndarray
     tree: Tree
 
     @property
@@ -118,7 +120,7 @@ def plan(
         world: of this robot and grid, to save building it again.
         goal_bias: share of expansions that aim at the goal.
         straight_rate: share of expansions that go straight, for methods with a sampler.
-        max_expansions: budget.
+        max_expansions: budget; one iteration of all lanes is the least.
         capacity: most nodes of the tree.
         lanes: expansions at a time; "rrt-connect" takes two at least.
         time_limit_s: wall time of the search [s].
@@ -154,29 +156,34 @@ def plan(
     policy, tree = _setup(world, start, goal, method, sampler, make, capacity)
     scene = scene or ExactScene(robot, grid)
     tried, spent, rejected = 0, Counter(), Counter()
-    for attempt in range(ATTEMPTS):
-        left_s = time_limit_s - spent["search_s"]
-        if attempt and (max_expansions - tried < lanes or left_s <= 0):
-            break
-        found = search(
-            world,
-            policy,
-            tree,
-            key=jax.random.fold_in(key, attempt),
-            stop=make_stop(ARRIVED, max_iterations=max((max_expansions - tried) // lanes, 1)),
-            time_limit_s=left_s,
-            on_progress=on_progress,
-        )
-        raw = connection_path(found.tree) if method == "rrt-connect" else tree_path(found.tree)
-        reached = raw is not None and found.stopped is Stopped.REACHED
-        raw = np.asarray(start)[None] if raw is None else raw
-        result = _finish(scene, world, found, raw, reached, key, lanes)
-        tried += result.expansions
-        spent.update(result.timing)
-        rejected.update(result.rejected)
-        if result.status is not Status.NOT_VERIFIED:
-            break
-        world = dataclasses.replace(world, resolution=world.resolution / 2)
+    results: list[PlanResult] = []
+    with interruptible() as interrupted:
+        for attempt in range(ATTEMPTS):
+            left_s = time_limit_s - spent["search_s"]
+            if attempt and (max_expansions - tried < lanes or left_s <= 0):
+                break
+            iterations = max((max_expansions - tried) // lanes, 1)
+            found = search(
+                world,
+                policy,
+                tree,
+                key=jax.random.fold_in(key, attempt),
+                stop=make_stop(ARRIVED, max_iterations=iterations),
+                time_limit_s=left_s,
+                on_progress=on_progress,
+            )
+            raw = connection_path(found.tree) if method == "rrt-connect" else tree_path(found.tree)
+            reached = raw is not None and found.stopped is Stopped.REACHED
+            raw = np.asarray(start)[None] if raw is None else raw
+            results.append(_finish(scene, world, found, raw, reached, key, lanes))
+            tried += results[-1].expansions
+            spent.update(results[-1].timing)
+            rejected.update(results[-1].rejected)
+            if results[-1].status is not Status.NOT_VERIFIED or interrupted.is_set():
+                break
+            world = dataclasses.replace(world, resolution=world.resolution / 2)
+    # A path that was refused tells more than a search that found none.
+    result = next((r for r in reversed(results) if r.verification is not None), results[-1])
     return dataclasses.replace(
         result, timing=dict(spent), expansions=tried, rejected=dict(rejected)
     )
@@ -288,13 +295,14 @@ def _finish(
         path = shortcut(finer, raw, key=key)
     clock.append(time.perf_counter())
     trajectory = trajectory_of(world, path)
+    limits = {"lower": np.asarray(world.lower), "upper": np.asarray(world.upper)}
     if reached:
-        verification = verify(
-            scene,
-            trajectory,
-            lower=np.asarray(world.lower),
-            upper=np.asarray(world.upper),
-        )
+        verification = verify(scene, trajectory, **limits)
+        if not verification.ok:
+            longer = trajectory_of(world, raw)
+            seen = verify(scene, longer, **limits)
+            if seen.ok:
+                path, trajectory, verification = raw, longer, seen
     clock.append(time.perf_counter())
     if verification is not None:
         status = Status.SOLVED if verification.ok else Status.NOT_VERIFIED

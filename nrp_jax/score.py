@@ -261,6 +261,8 @@ def _run_command(arguments: argparse.Namespace) -> int:
     seeds = [home_seed(dataset.settings, "test", k) for k in range(len(dataset.grids))]
     figures = {
         "task": task,
+        "weights": {kind: getattr(arguments, kind) or "packaged" for kind in KINDS},
+        "networks": {kind: dataclasses.asdict(s.config) for kind, s in tested.items()},
         "checked": not arguments.unchecked,
         "nodes": arguments.nodes,
         "machine": machine(),
@@ -283,9 +285,9 @@ def _maps(
     kinds = (".npz", ".yaml", ".yml", ".xml")
     grids = {}
     for file in sorted(file for file in folder.rglob("*") if file.suffix in kinds):
-        grid = load_map(file)
-        grid = dataclasses.replace(grid, origin=(0.0, 0.0, grid.origin[2]))
         try:
+            grid = load_map(file)
+            grid = dataclasses.replace(grid, origin=(0.0, 0.0, grid.origin[2]))
             world = build_world(robot, grid)
             for kind, sampler in tested.items():
                 samplers.check_fits(sampler, robot, world, kind)

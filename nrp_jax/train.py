@@ -70,8 +70,8 @@ def train(
         RuntimeError: the validation loss is not finite any more.
     """
     parts = {"model": dataclasses.asdict(config), "settings": dataclasses.asdict(settings)}
-    out = claim(Path(out), {**parts, "data": stamp})
     training, validation = split_by_home(np.asarray(examples.home), settings)
+    out = claim(Path(out), {**parts, "data": stamp})
     sample = make_batch(config, robot, examples, jnp.zeros(1, jnp.int32))
     module = build_module(config, sample.waypoints.shape[-1])
     size = min(settings.batch, len(training))
@@ -288,8 +288,8 @@ def _run_command(arguments: argparse.Namespace) -> int:
     try:
         model = train(config, robot, examples, arguments.out, settings=settings, stamp=stamp)
     except KeyboardInterrupt:
-        print(f"interrupted; the same command goes on from the last epoch in {arguments.out}")
-        return 1
+        print(f"the same command goes on from the last epoch in {arguments.out}")
+        raise
     figures = ", ".join(f"{name} {value:.4g}" for name, value in model.info["best"].items())
     print(f"wrote {Path(arguments.out) / 'model.npz'}: {figures}")
     return 0

@@ -353,7 +353,7 @@ def _round_base(robot: MobileRobot, grid: Grid) -> RoundBase | None:
 
 
 def _low_field(grid: Grid, height: float) -> Field:
-    return make_field(grid.flatten(-np.inf, height))
+    return make_field(grid.flatten(0.0, height))
 
 
 def _placement(spheres: Spheres, chain: Chain) -> jax.Array:

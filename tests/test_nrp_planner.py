@@ -1,6 +1,7 @@
 """Plans in homes, from start to goal, each verified by C MuJoCo."""
 
 import json
+import signal
 import types
 
 import jax
@@ -12,7 +13,7 @@ import nrp_jax
 from nrp_jax import planner, viz
 from nrp_jax.bench import planning
 from nrp_jax.cli import main
-from nrp_jax.exact import ExactScene, verify
+from nrp_jax.exact import ExactScene, Verification, verify
 from nrp_jax.planner import Status, plan, trajectory_of
 from vrrt_jax.core.shortcut import shortcut
 from vrrt_jax.core.types import pytree
@@ -244,12 +245,34 @@ def test_command_line(tmp_path, home, capsys, monkeypatch):
     assert told.out.startswith("SOLVED") and "vrrt-jax[plot]" in told.err
 
 
+def test_a_refused_path_is_told(solve, monkeypatch):
+    """The tree's own path stands in for the short one; with both refused, that is the outcome."""
+    seen = []
+
+    def refuse(scene, trajectory, **limits):
+        seen.append(trajectory)
+        return Verification(ok=len(seen) == accepted, checked=1, problem="touches")
+
+    monkeypatch.setattr(planner, "verify", refuse)
+    accepted = 2
+    result = solve("rrt-connect")
+    assert result.ok and len(seen) == 2
+    np.testing.assert_array_equal(result.path, result.raw_path)
+    accepted = 0
+    result = solve("rrt-connect")
+    assert result.status is Status.NOT_VERIFIED and len(result.path) > 1
+
+
 def test_an_interrupted_bench_ends(snake, home, scene, monkeypatch):
     asked = planning.Home(
         seed=0, grid=home, world=None, scene=scene, starts=START[None], goals=GOAL[None]
     )
-    stopped = types.SimpleNamespace(status=Status.INTERRUPTED)
-    monkeypatch.setattr(planning, "plan", lambda *_, **__: stopped)
+
+    def interrupted(*_, **__):
+        signal.raise_signal(signal.SIGINT)  # a flag while something plans
+        return types.SimpleNamespace(status=Status.SOLVED)
+
+    monkeypatch.setattr(planning, "plan", interrupted)
     budget = {"max_expansions": 10, "lanes": 10, "goal_bias": 0.1}
     with pytest.raises(KeyboardInterrupt):
         planning.run(snake, [asked], "rrt", None, **budget, on_result=pytest.fail)

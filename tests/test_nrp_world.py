@@ -222,6 +222,19 @@ def test_flatten_crop_and_save(tmp_path):
 ROS = "image: home.pgm\nresolution: 0.05\norigin: [-1.0, -2.0, 0.0]\noccupied_thresh: 0.65\n"
 
 
+def test_what_lies_below_the_floor_is_in_nobodys_way():
+    robot = nrp_jax.load_robot("fetch")
+    occupied = np.zeros((60, 60, 21), bool)
+    occupied[..., 0] = True  # the floor itself
+    grid = nrp_jax.Grid(occupied=occupied, origin=(0.0, 0.0, -0.1))
+    world = nrp_jax.build_world(robot, grid)
+    q = np.zeros((1, 11), np.float32)
+    q[0, :2], q[0, 3:] = 3.0, [0.2, 1.3, 1.4, -0.2, 1.5, 0.0, 1.66, 0.0]
+    assert nrp_jax.batch_is_free(world, jnp.asarray(q))[0]
+    assert SphereLoop(robot, grid).is_free(q[0])
+    assert not ExactScene(robot, grid).touching(q[0])
+
+
 @pytest.mark.parametrize(
     ("free_thresh", "negate", "mode"),
     [(0.196, 0, "trinary"), (0.25, 0, "trinary"), (0.25, 1, "trinary"), (0.25, 0, "scale")],

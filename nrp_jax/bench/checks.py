@@ -82,8 +82,12 @@ class SphereLoop:
         place = (centre - self.corner) / size
         low = np.floor(place - reach / size).astype(int)
         high = np.floor(place + reach / size).astype(int) + 1
-        if flat:
-            low[2], high[2] = 0, 1 if top is None else int(np.ceil(top / size - 1e-6))
+        if top is not None:
+            floor = -self.corner[2]  # above the lowest layer
+            low[2] = int(np.floor(floor / size + 1e-6))
+            high[2] = int(np.ceil((floor + top) / size - 1e-6))
+        elif flat:
+            low[2], high[2] = 0, 1
         low, high = np.maximum(low, 0), np.minimum(high, self.solid.shape)
         cells = np.argwhere(self.solid[tuple(map(slice, low, high))]) + low
         gap = np.maximum(np.maximum(cells - place, place - cells - 1), 0) * size

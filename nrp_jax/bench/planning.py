@@ -17,6 +17,7 @@ from nrp_jax.houses import CELLS
 from nrp_jax.planner import KINDS, METHODS, PlanResult, Status, plan
 from nrp_jax.robots import MobileRobot, load_robot
 from nrp_jax.world import GridWorld, build_world
+from vrrt_jax.core.search import interruptible
 from vrrt_jax.core.timing import machine
 
 
@@ -68,21 +69,22 @@ def run(
     results = []
     for home in homes:
         for index, (start, goal) in enumerate(zip(home.starts, home.goals, strict=True)):
-            result = plan(
-                robot,
-                home.grid,
-                start,
-                goal,
-                key=jax.random.key(home.seed + index),
-                method=method,
-                sampler=sampler,
-                world=home.world,
-                scene=home.scene,
-                goal_bias=goal_bias,
-                max_expansions=max_expansions,
-                lanes=lanes,
-            )
-            if result.status is Status.INTERRUPTED:
+            with interruptible() as interrupted:
+                result = plan(
+                    robot,
+                    home.grid,
+                    start,
+                    goal,
+                    key=jax.random.key(home.seed + index),
+                    method=method,
+                    sampler=sampler,
+                    world=home.world,
+                    scene=home.scene,
+                    goal_bias=goal_bias,
+                    max_expansions=max_expansions,
+                    lanes=lanes,
+                )
+            if interrupted.is_set():
                 raise KeyboardInterrupt
             results.append(result)
             on_result(result)

@@ -45,6 +45,12 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
         return EXIT_INTERRUPTED
 
 
+def usable_cores() -> int:
+    """The number of cores that this process may use."""
+    usable = getattr(os, "sched_getaffinity", None)
+    return len(usable(0)) if usable else os.cpu_count() or 1
+
+
 def end_with_parent() -> None:
     """Call this in a worker process: it ends when the one that started it is killed."""
     parent = multiprocessing.parent_process()

@@ -1,6 +1,5 @@
 """Timing on a machine that others use too: the best of many, everything in one process."""
 
-import os
 import platform
 import time
 from collections.abc import Callable
@@ -8,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
+
+from vrrt_jax.core.command import usable_cores
 
 
 def best_ms(function: Callable, *args: Any, repeats: int = 30) -> tuple[float, float]:
@@ -43,16 +44,10 @@ def machine() -> dict[str, str | int]:
     """What a benchmark ran on, for its report."""
     return {
         "processor": _processor(),
-        "cores": _cores(),
+        "cores": usable_cores(),
         "platform": platform.platform(),
         "device": str(jax.devices()[0]),
     }
-
-
-def _cores() -> int:
-    """Those that this process may use."""
-    usable = getattr(os, "sched_getaffinity", None)
-    return len(usable(0)) if usable else os.cpu_count() or 1
 
 
 def _processor() -> str:
