@@ -1,5 +1,7 @@
 """The Fetch through the whole chain: edges that turn, the expert's rows, the packaged samplers."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,11 +65,22 @@ def test_rows(robot, world, roadmap):
 
 
 @pytest.mark.parametrize("kind", ["discriminator", "cvae"])
-def test_packaged_samplers_know_what_is_free(kind, world, roadmap):
-    sampler = load_sampler("fetch", kind)
-    q_from, q_goal = (jnp.asarray(roadmap.q[k : k + 32]) for k in (0, 32))
-    q = np.asarray(samplers.propose(sampler, world, q_from, q_goal, jax.random.key(0)))
-    assert np.all((q >= world.lower - 1e-5) & (q <= world.upper + 1e-5))
-    assert np.abs(q - q_from)[:, :2].max() < 2.6
-    random = np.random.default_rng(0).uniform(world.lower, world.upper, (2048, 11))
-    assert free(world, q).mean() > 2 * free(world, random).mean()
+def test_packaged_samplers_know_the_way(kind, world, roadmap, rng):
+    """Their first choice, without a look at its edge; and that of the same weights in disorder."""
+    trained = load_sampler("fetch", kind, checked=1)
+    disorder = jax.tree.map(
+        lambda leaf: jnp.asarray(rng.permutation(np.ravel(leaf)).reshape(leaf.shape)),
+        trained.variables,
+    )
+    q_from, q_goal = roadmap.q[:128], roadmap.q[128:256]
+    nearer, is_free = [], []
+    for sampler in (trained, dataclasses.replace(trained, variables=disorder)):
+        ends = jnp.asarray(q_from), jnp.asarray(q_goal)
+        q = np.asarray(samplers.propose(sampler, world, *ends, jax.random.key(0)))
+        assert np.all((q >= world.lower - 1e-5) & (q <= world.upper + 1e-5))
+        assert np.abs(q - q_from)[:, :2].max() < 2.6
+        left, before = (np.linalg.norm((q_goal - at)[:, :2], axis=1) for at in (q, q_from))
+        nearer.append(np.mean(left < before))
+        is_free.append(free(world, q).mean())
+    assert nearer[0] > 0.75 > 0.6 > nearer[1]
+    assert is_free[0] > 0.8 and (kind == "cvae" or is_free[0] > is_free[1] + 0.2)
