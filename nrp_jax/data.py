@@ -207,8 +207,18 @@ def _run(out: Path, settings: Settings, todo: list[tuple[str, int]], jobs: int):
         for split, index in todo:
             name = _name(split, index)
             names[pool.submit(make_shard, settings, split, index, out / name)] = name
+        failure = None
         for future in concurrent.futures.as_completed(names):
-            yield names[future], future.result()
+            if future.cancelled():
+                continue
+            if problem := future.exception():
+                failure = failure or problem
+                for other in names:
+                    other.cancel()
+            else:  # also of those that were under way when another failed
+                yield names[future], future.result()
+        if failure:
+            raise failure
     finally:
         pool.shutdown(cancel_futures=True)
 
