@@ -18,7 +18,7 @@ from nrp_jax.robots import MobileRobot
 from nrp_jax.samplers import check_fits, load_sampler
 from nrp_jax.world import GridWorld, batch_is_free, build_world
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import into_limits
+from vrrt_jax.core.edges import into_limits, unwrapped
 from vrrt_jax.core.rrt import RRTConnect, connection_path, tree_path
 from vrrt_jax.core.search import SearchResult, Stopped, interruptible, make_stop, search
 from vrrt_jax.core.shortcut import padded, path_length, shortcut
@@ -232,10 +232,7 @@ def trajectory_of(world: GridWorld, path: np.ndarray) -> np.ndarray:
     padding = (0, room - len(index))
     q_a, q_b = (np.pad(path[index + k], [padding, (0, 0)], mode="edge") for k in (0, 1))
     points = _interpolate(world, q_a, q_b, np.pad(fraction, padding))
-    trajectory = np.concatenate([path[:1], np.asarray(points)[: len(index)]])
-    wraps = np.asarray(world.wraps)
-    trajectory[:, wraps] = np.unwrap(trajectory[:, wraps], axis=0)
-    return trajectory
+    return unwrapped(world, np.concatenate([path[:1], np.asarray(points)[: len(index)]]))
 
 
 @jax.jit

@@ -9,6 +9,7 @@ import pytest
 from nrp_jax import batch_is_free, build_world, expert, load_robot
 from nrp_jax.grid import Grid
 from nrp_jax.houses import generate_house
+from nrp_jax.robots import batch_link_features
 
 NODES, QUERIES, WAYPOINTS = 900, 20, 8
 TOLERANCE = 1e-4  # of lengths in float32, relative
@@ -99,7 +100,7 @@ def test_roadmap(robot, world, roadmap):
     assert abs(lengths - lengths.T).max() == 0
     a, b = lengths.nonzero()
     assert np.abs(q[a, :2] - q[b, :2]).max() < 2.0
-    tips = np.asarray(expert.batch_link_features(robot, q))[:, :, :2]
+    tips = np.asarray(batch_link_features(robot, q))[:, :, :2]
     assert np.abs(tips[b] - q[a, None, :2]).max() < 2.0
     assert np.isfinite(path_lengths(roadmap, 0)).all()
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from vrrt_jax.config import PlannerConfig, PlanResult
 from vrrt_jax.core import tree as trees
+from vrrt_jax.core.edges import unwrapped
 from vrrt_jax.core.rrt import RRTConnect, connection_path, tree_path
 from vrrt_jax.core.search import SearchResult, Stopped, make_stop, search
 from vrrt_jax.core.shortcut import path_length, shortcut
@@ -233,14 +234,14 @@ def finish(
     shortcut(world, raw_path, key=key, rounds=0)
     shortcut_compile_s = time.perf_counter() - started
     started = time.perf_counter()
-    path = _going_on(robot, shortcut(world, raw_path, key=key, rounds=config.shortcut_rounds))
+    path = unwrapped(world, shortcut(world, raw_path, key=key, rounds=config.shortcut_rounds))
     shortcut_s = time.perf_counter() - started
 
     started = time.perf_counter()
     obstacles = obstacle_list(world)
     verification = verify_path(robot, obstacles, path, step=config.verify_step)
     if not verification.ok:
-        longer = _going_on(robot, raw_path)
+        longer = unwrapped(world, raw_path)
         raw = verify_path(robot, obstacles, longer, step=config.verify_step)
         if raw.ok:
             path, verification = longer, raw
@@ -279,10 +280,3 @@ def finish(
         history=found.history,
         tree=found.tree,
     )
-
-
-def _going_on(robot: Robot, path: np.ndarray) -> np.ndarray:
-    """The path (P, D) with joints that wrap going on, so that a controller may interpolate."""
-    path = np.array(path)
-    path[:, robot.wraps] = np.unwrap(path[:, robot.wraps], axis=0)
-    return path

@@ -15,7 +15,15 @@ from vrrt_jax.core.rrt import RRT, RRTConnect, connection_path, tree_path
 from vrrt_jax.core.search import interruptible, make_stop, search
 from vrrt_jax.core.types import Status, Tree
 from vrrt_jax.core.world import World
-from vrrt_jax.finish import STATUS_OF, finish, finish_visual, time_left, timed, with_time_of
+from vrrt_jax.finish import (
+    HURRIED,
+    STATUS_OF,
+    finish,
+    finish_visual,
+    time_left,
+    timed,
+    with_time_of,
+)
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.sight import Setup, Sight, visual_setup, visual_stop
 from vrrt_jax.splat.model import SelfModel
@@ -23,7 +31,7 @@ from vrrt_jax.splat.types import Camera
 from vrrt_jax.visual import best_probes, forest, plant
 
 PLANTING = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
-ENDED = (Status.TIME_LIMIT, Status.INTERRUPTED)  # before its losses compare with others'
+ENDED = tuple(STATUS_OF[stopped] for stopped in HURRIED)  # before losses compare with others'
 AGAIN = (Status.NO_MATCH, Status.NO_PATH, Status.NOT_VERIFIED)  # worth another attempt
 RRT_STAR_RADIUS = 1.9  # [rad] nodes of a sparse tree in seven dimensions lie that far apart
 

@@ -17,7 +17,7 @@ from nrp_jax.houses import CELLS
 from nrp_jax.planner import KINDS, METHODS, PlanResult, Status, plan
 from nrp_jax.robots import MobileRobot, load_robot
 from nrp_jax.world import GridWorld, build_world
-from vrrt_jax.core.search import interruptible
+from vrrt_jax.core.search import uninterrupted
 from vrrt_jax.core.timing import machine
 
 
@@ -69,7 +69,7 @@ def run(
     results = []
     for home in homes:
         for index, (start, goal) in enumerate(zip(home.starts, home.goals, strict=True)):
-            with interruptible() as interrupted:
+            with uninterrupted():
                 result = plan(
                     robot,
                     home.grid,
@@ -84,8 +84,6 @@ def run(
                     max_expansions=max_expansions,
                     lanes=lanes,
                 )
-            if interrupted.is_set():
-                raise KeyboardInterrupt
             results.append(result)
             on_result(result)
     solved = [result for result in results if result.ok]

@@ -21,6 +21,7 @@ from vrrt_jax.bench.tasks import (
 )
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.edges import joint_error
+from vrrt_jax.core.shortcut import path_length
 from vrrt_jax.core.types import Status
 from vrrt_jax.core.verify import verify_path
 from vrrt_jax.core.world import World, obstacle_list
@@ -119,7 +120,7 @@ def solve(
     valid = not collisions or verify_path(robot, obstacle_list(world), attempt.path).ok
     success = right and valid and (attempt.has_path or not collisions)
     psnr_db = image_psnr(robot_name, attempt.path[-1], images, scenery)
-    length = _length(world, attempt.path)
+    length = path_length(world, attempt.path)
     reference, cause = None, ""
     if collisions and right and (valid or not attempt.has_path):
         reference = _reference_length(robot, world, task, key)
@@ -147,15 +148,10 @@ def solve(
     }
 
 
-def _length(world: World, path: np.ndarray) -> float:
-    steps = [joint_error(world, a, b) for a, b in zip(path, path[1:], strict=False)]
-    return float(sum(np.linalg.norm(step) for step in steps))
-
-
 def _reference_length(robot: Robot, world: World, task: Task, key: jax.Array) -> float | None:
     """Of RRT-Connect's shortened path to the true goal, if it finds one."""
     found = planner.plan_to_configuration(robot, world, task.q_start, task.q_goal, key=key)
-    return _length(world, found.path) if found.ok else None
+    return found.cost if found.ok else None
 
 
 def _cause(attempt: Attempt, *, right: bool, valid: bool, alike: bool, known: bool) -> str:

@@ -206,18 +206,12 @@ def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
                 distance, [v["path_length"] or float("nan") for v in levels], marker="o", label=name
             )
             labels.append(name)
-            counts = [sum(v["causes"].get(c, 0) for v in levels) for c in CAUSES]
-            stacks.append([100 * count / total for count in counts])
+            stacks.append(_cause_shares(levels))
             spent = sorted(row["time_s"] for row in rows)
             times.step(spent, 100 * np.arange(1, len(spent) + 1) / len(spent), label=name)
-    left = [0] * len(labels)
-    for cause, colour, k in zip(CAUSES, CAUSE_COLOURS, range(len(CAUSES)), strict=True):
-        width = [stack[k] for stack in stacks]
-        causes.barh(labels, width, left=left, color=colour, label=cause)
-        left = [a + b for a, b in zip(left, width, strict=True)]
+    _stack_bars(causes, labels, stacks, CAUSES, CAUSE_COLOURS)
     by_level.set(xlabel="distance from start to goal [rad]", ylabel="success [%]", ylim=(0, 102))
     causes.set(xlabel="failed tasks [%]", xlim=(0, 100))
-    causes.invert_yaxis()
     times.set(
         xlabel="planning time without compilation [s]",
         ylabel="tasks done by then [%]",
@@ -244,26 +238,34 @@ def _ablation_figure(group: Sequence[dict[str, Any]], path: Path) -> None:
     for results in sorted(group, key=_is_paper, reverse=True):
         base = "paper's" if _is_paper(results) else "default"
         for name, summary in _variants(results).items():
-            levels = summary["levels"]
-            total = sum(v["n"] for v in levels)
-            counts = [sum(v["causes"].get(c, 0) for v in levels) for c in CAUSES]
-            labels.append(f"{base}, {name} (n = {total})")
-            stacks.append([100 * count / total for count in (total - sum(counts), *counts)])
+            shares = _cause_shares(summary["levels"])
+            labels.append(f"{base}, {name} (n = {sum(v['n'] for v in summary['levels'])})")
+            stacks.append([100 - sum(shares), *shares])
     figure, axis = plt.subplots(figsize=(10, 1.5 + 0.24 * len(labels)), layout="constrained")
-    left = [0.0] * len(labels)
-    for k, (name, colour) in enumerate(
-        zip(("solved", *CAUSES), (SOLVED_COLOUR, *CAUSE_COLOURS), strict=True)
-    ):
-        width = [stack[k] for stack in stacks]
-        axis.barh(labels, width, left=left, color=colour, label=name)
-        left = [a + b for a, b in zip(left, width, strict=True)]
+    _stack_bars(axis, labels, stacks, ("solved", *CAUSES), (SOLVED_COLOUR, *CAUSE_COLOURS))
     axis.set(xlabel="tasks [%]", xlim=(0, 100))
     axis.margins(y=0.01)
-    axis.invert_yaxis()
     figure.legend(fontsize="small", ncols=4, loc="outside lower center")
     figure.suptitle(f"ablation: {group[0]['robot']}")
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def _cause_shares(levels: Sequence[dict[str, Any]]) -> list[float]:
+    """Of all tasks, those that failed for each of :data:`CAUSES` [%]."""
+    total = sum(level["n"] for level in levels)
+    return [
+        100 * sum(level["causes"].get(cause, 0) for level in levels) / total for cause in CAUSES
+    ]
+
+
+def _stack_bars(axis, labels: Sequence[str], stacks: Sequence[Sequence[float]], names, colours):
+    """A bar for each label, the first on top, of parts with a name and a colour each."""
+    left = np.zeros(len(labels))
+    for width, name, colour in zip(np.transpose(stacks), names, colours, strict=True):
+        axis.barh(labels, width, left=left, color=colour, label=name)
+        left += width
+    axis.invert_yaxis()
 
 
 def _percent(share: float | None) -> str:

@@ -148,6 +148,13 @@ def joint_error(world: Straight, q: np.ndarray, q_goal: np.ndarray) -> np.ndarra
     return np.abs(np.asarray(difference(world, jnp.asarray(q), jnp.asarray(q_goal))))
 
 
+def unwrapped(world: Straight, path: np.ndarray) -> np.ndarray:
+    """The path (P, D) with joints that wrap going on, so that a controller may interpolate."""
+    path, wraps = np.array(path), np.asarray(world.wraps)
+    path[:, wraps] = np.unwrap(path[:, wraps], axis=0)
+    return path
+
+
 def distance(world: Space, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
     """Length (...) of the edge between configurations (..., D)."""
     return world.distance(q_a, q_b)

@@ -204,6 +204,15 @@ def _record(state: SearchState, seconds: float) -> tuple[float, float, float, fl
     return float(np.max(tree.iteration)), seconds, float(best), float(np.max(tree.size))
 
 
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Raise KeyboardInterrupt at the end after a Ctrl-C, for what is no result if it ends early."""
+    with interruptible() as interrupted:
+        yield
+    if interrupted.is_set():
+        raise KeyboardInterrupt
+
+
 _interrupted: list[threading.Event] = []  # of the outermost block that runs
 
 

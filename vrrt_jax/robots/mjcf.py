@@ -59,11 +59,15 @@ def _urdf_with_visuals(path: Path) -> mujoco.MjSpec | None:
     spec.modelfiledir = str(path.resolve().parent)
     spec = _plain(spec)
     for body in spec.bodies:
-        if any(not (geom.contype or geom.conaffinity) for geom in body.geoms):
+        if not all(map(_collides, body.geoms)):
             for geom in body.geoms:
-                geom.group = _HIDDEN if geom.contype or geom.conaffinity else _SEEN
+                geom.group = _HIDDEN if _collides(geom) else _SEEN
     spec.copy().compile()  # the formats of many meshes are not read
     return spec
+
+
+def _collides(geom: mujoco.MjsGeom) -> bool:
+    return bool(geom.contype or geom.conaffinity)
 
 
 def _plain(spec: mujoco.MjSpec) -> mujoco.MjSpec:
@@ -158,7 +162,7 @@ def _fold(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:
 def collide_visuals(spec: mujoco.MjSpec) -> None:
     """Let the visual meshes collide, each as its convex hull, and delete all other geoms."""
     for geom in list(spec.geoms):
-        if geom.type == mujoco.mjtGeom.mjGEOM_MESH and not (geom.contype or geom.conaffinity):
+        if geom.type == mujoco.mjtGeom.mjGEOM_MESH and not _collides(geom):
             geom.contype = geom.conaffinity = 1
         else:
             spec.delete(geom)
@@ -197,7 +201,7 @@ def strip_spec(spec: mujoco.MjSpec, *, visuals: bool) -> None:
         geom.margin = geom.gap = 0.0
         # a floor or a height field is the world's, and neither can be covered with spheres
         is_ground = geom.type in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-        if is_ground or (not visuals and not (geom.contype or geom.conaffinity)):
+        if is_ground or (not visuals and not _collides(geom)):
             spec.delete(geom)
     if not visuals:
         for geom in spec.geoms:
