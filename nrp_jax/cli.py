@@ -16,8 +16,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from nrp_jax import data, houses, score, train
-    from nrp_jax.bench import checks, planning
+    from nrp_jax.bench import checks, planning, score
+    from nrp_jax.homes import houses
+    from nrp_jax.learning import data, train
 
     parser = command.Parser(
         prog="nrp", description="Motion planning in homes, with learned samplers."
@@ -57,11 +58,11 @@ def _add_plan(commands) -> None:
 def _plan(arguments: argparse.Namespace) -> int:
     import jax
 
-    from nrp_jax.grid import load_map
+    from nrp_jax.homes.grid import load_map
     from nrp_jax.planner import KINDS, plan
-    from nrp_jax.robots import load_robot
     from nrp_jax.samplers import load_sampler
-    from nrp_jax.world import build_world
+    from nrp_jax.scene.robots import load_robot
+    from nrp_jax.scene.world import build_world
 
     robot, grid = load_robot(arguments.robot), load_map(arguments.map)
     if arguments.crop is not None:

@@ -11,15 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nrp_jax.exact import STEP, ExactScene, Verification, verify
-from nrp_jax.grid import Grid
-from nrp_jax.policies import RRT, NeuralRRT
-from nrp_jax.robots import MobileRobot
+from nrp_jax.homes.grid import Grid
+from nrp_jax.planners.nrp import RRT, NeuralRRT
 from nrp_jax.samplers import check_fits, load_sampler
-from nrp_jax.world import GridWorld, batch_is_free, build_world
+from nrp_jax.scene.exact import STEP, ExactScene, Verification, verify
+from nrp_jax.scene.robots import MobileRobot
+from nrp_jax.scene.world import GridWorld, batch_is_free, build_world
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import into_limits, unwrapped
-from vrrt_jax.core.rrt import RRTConnect, connection_path, tree_path
+from vrrt_jax.core.planners.rrt import tree_path
+from vrrt_jax.core.planners.rrt_connect import RRTConnect, connection_path
 from vrrt_jax.core.search import SearchResult, Stopped, interruptible, make_stop, search
 from vrrt_jax.core.shortcut import padded, path_length, shortcut
 from vrrt_jax.core.types import Rejection, Tree

@@ -11,14 +11,14 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
-from nrp_jax import features
-from nrp_jax.checkpoint import Model, build_module, check_model, load_model
-from nrp_jax.context import SIDE
-from nrp_jax.examples import describe, read, relations, surrounding_map, view
-from nrp_jax.grid import HEIGHT, RESOLUTION
-from nrp_jax.models import CVAE, ModelConfig, check_choices
-from nrp_jax.robots import MobileRobot, batch_link_features, load_robot
-from nrp_jax.world import GridWorld
+from nrp_jax.homes.grid import HEIGHT, RESOLUTION
+from nrp_jax.learning import features
+from nrp_jax.learning.batches import describe, read, relations, surrounding_map, view
+from nrp_jax.learning.checkpoint import Model, build_module, check_model, load_model
+from nrp_jax.learning.local_map import SIDE
+from nrp_jax.learning.models import CVAE, ModelConfig, check_choices
+from nrp_jax.scene.robots import MobileRobot, batch_link_features, load_robot
+from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.edges import difference, into_limits, points_along
 from vrrt_jax.core.types import pytree, static
 
@@ -269,7 +269,7 @@ def check_fits(sampler: Any, robot: MobileRobot, world: GridWorld, kind: str) ->
     if abs(cell - RESOLUTION) > 1e-6 or layers != expected:
         raise ValueError(
             f"the map has {layers} layers of cells of {cell:g} m; samplers have seen {expected} of "
-            f"{RESOLUTION} m: see nrp_jax.grid.coarsened and Grid.crop"
+            f"{RESOLUTION} m: see nrp_jax.homes.grid.coarsened and Grid.crop"
         )
     bottom = float(world.field.origin[2])
     if not robot.planar and abs(bottom) > RESOLUTION / 2:

@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from nrp_jax.grid import Grid
+from nrp_jax.homes.grid import Grid
 from nrp_jax.planner import PlanResult
-from nrp_jax.robots import MobileRobot
-from nrp_jax.world import GridWorld
+from nrp_jax.scene.robots import MobileRobot
+from nrp_jax.scene.world import GridWorld
 
 _EDGE_POINTS = 9
 _SHOWN = 4000  # edges of a tree at most

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from nrp_jax.grid import Grid
-from nrp_jax.robots import load_robot
-from nrp_jax.world import batch_is_free, build_world
+from nrp_jax.homes.grid import Grid
+from nrp_jax.scene.robots import load_robot
+from nrp_jax.scene.world import batch_is_free, build_world
 
 
 def random_grid(seed: int, size: int = 60, height: int = 1, boxes: int = 14):

@@ -8,10 +8,14 @@ _choose_backend()  # before anything imports MuJoCo
 
 from vrrt_jax.config import PlannerConfig, PlanResult  # noqa: E402
 from vrrt_jax.core.edges import difference, distance  # noqa: E402
-from vrrt_jax.core.kinematics import link_poses  # noqa: E402
-from vrrt_jax.core.types import Obstacle, Status  # noqa: E402
-from vrrt_jax.core.verify import Verification, verify_path  # noqa: E402
-from vrrt_jax.core.world import (  # noqa: E402
+from vrrt_jax.core.types import Status  # noqa: E402
+from vrrt_jax.planner import plan, plan_batch, plan_to_configuration  # noqa: E402
+from vrrt_jax.problems import Problem, load_problem, load_world, problem_names  # noqa: E402
+from vrrt_jax.robots import Robot, load_robot, robot_names  # noqa: E402
+from vrrt_jax.robots.kinematics import link_poses  # noqa: E402
+from vrrt_jax.scene.obstacles import Obstacle
+from vrrt_jax.scene.verify import Verification, verify_path  # noqa: E402
+from vrrt_jax.scene.world import (  # noqa: E402
     World,
     build_world,
     is_free,
@@ -20,11 +24,8 @@ from vrrt_jax.core.world import (  # noqa: E402
     obstacle_list,
     with_obstacles,
 )
-from vrrt_jax.planner import plan, plan_batch, plan_to_configuration  # noqa: E402
-from vrrt_jax.problems import Problem, load_problem, load_world, problem_names  # noqa: E402
-from vrrt_jax.robots import Robot, load_robot, robot_names  # noqa: E402
 from vrrt_jax.splat.camera import camera_from_matrix, look_at, orbit  # noqa: E402
-from vrrt_jax.splat.goal import read_image, write_image  # noqa: E402
+from vrrt_jax.splat.images import read_image, write_image  # noqa: E402
 from vrrt_jax.splat.model import SelfModel, load_self_model, save_self_model  # noqa: E402
 from vrrt_jax.splat.raster import render  # noqa: E402
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel  # noqa: E402

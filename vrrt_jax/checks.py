@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.kinematics import Chain, link_poses
-from vrrt_jax.core.verify import contacts
-from vrrt_jax.core.world import World, is_free, obstacle_list
+from vrrt_jax.robots.kinematics import Chain, link_poses
 from vrrt_jax.robots.robot import Robot
+from vrrt_jax.scene.verify import contacts
+from vrrt_jax.scene.world import World, is_free, obstacle_list
 from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera, SplatModel

@@ -185,7 +185,7 @@ def _pictures(problem, result, out: Path) -> None:
 def _problem(arguments: argparse.Namespace):
     from vrrt_jax import problems
     from vrrt_jax.robots import load_robot
-    from vrrt_jax.splat.goal import read_image
+    from vrrt_jax.splat.images import read_image
     from vrrt_jax.splat.model import load_self_model
 
     parts = ("robot", "world", "goal", "camera", "start")
@@ -228,7 +228,7 @@ def _render(arguments: argparse.Namespace) -> int:
 
     from vrrt_jax import checks, problems
     from vrrt_jax.robots import load_robot
-    from vrrt_jax.splat.goal import write_image
+    from vrrt_jax.splat.images import write_image
     from vrrt_jax.splat.mujoco_images import MeshRenderer
 
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
@@ -268,7 +268,7 @@ def _fit(arguments: argparse.Namespace) -> int:
 def _spheres(arguments: argparse.Namespace) -> int:
     from vrrt_jax.robots import load_robot
     from vrrt_jax.robots.fit import fit_spheres
-    from vrrt_jax.robots.measure import measure_spheres
+    from vrrt_jax.scene.sphere_errors import measure_spheres
 
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
     if arguments.out is not None:
@@ -291,7 +291,7 @@ def _spheres(arguments: argparse.Namespace) -> int:
 
 
 def _meshes(robot):
-    from vrrt_jax.robots.sources import install_hint, mesh_spec
+    from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 
     spec = mesh_spec(robot)
     if spec is None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from vrrt_jax.core.types import Status, Tree
-from vrrt_jax.core.verify import Verification
+from vrrt_jax.scene.verify import Verification
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

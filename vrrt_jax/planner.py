@@ -11,11 +11,15 @@ import numpy as np
 from vrrt_jax import checks
 from vrrt_jax.config import PlannerConfig, PlanResult
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.rrt import RRT, RRTConnect, connection_path, tree_path
+from vrrt_jax.core.planners.rrt import RRT, tree_path
+from vrrt_jax.core.planners.rrt_connect import RRTConnect, connection_path
 from vrrt_jax.core.search import interruptible, make_stop, search
 from vrrt_jax.core.types import Status, Tree
-from vrrt_jax.core.world import World
-from vrrt_jax.finish import (
+from vrrt_jax.robots.robot import Robot
+from vrrt_jax.scene.world import World
+from vrrt_jax.splat.model import SelfModel
+from vrrt_jax.splat.types import Camera
+from vrrt_jax.visual.finish import (
     HURRIED,
     STATUS_OF,
     finish,
@@ -24,11 +28,8 @@ from vrrt_jax.finish import (
     timed,
     with_time_of,
 )
-from vrrt_jax.robots.robot import Robot
-from vrrt_jax.sight import Setup, Sight, visual_setup, visual_stop
-from vrrt_jax.splat.model import SelfModel
-from vrrt_jax.splat.types import Camera
-from vrrt_jax.visual import best_probes, forest, plant
+from vrrt_jax.visual.goal import Setup, Sight, visual_setup, visual_stop
+from vrrt_jax.visual.policy import best_probes, forest, plant
 
 PLANTING = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
 ENDED = tuple(STATUS_OF[stopped] for stopped in HURRIED)  # before losses compare with others'

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from vrrt_jax.core.obstacles import load_obstacles
-from vrrt_jax.core.world import World, build_world
 from vrrt_jax.robots import Robot, load_robot, robot_names, scenes_dir
+from vrrt_jax.scene.obstacles import load_obstacles
+from vrrt_jax.scene.world import World, build_world
 from vrrt_jax.splat.camera import camera_from_matrix, look_at
-from vrrt_jax.splat.goal import read_image
+from vrrt_jax.splat.images import read_image
 from vrrt_jax.splat.model import SelfModel, load_self_model
 from vrrt_jax.splat.types import Camera
 

@@ -11,15 +11,15 @@ import numpy as np
 from PIL import Image
 
 from vrrt_jax.core.edges import difference
-from vrrt_jax.core.kinematics import link_poses
-from vrrt_jax.core.obstacles import signed_distances
-from vrrt_jax.core.world import World, obstacle_list
 from vrrt_jax.planner import PlanResult
 from vrrt_jax.problems import Problem
 from vrrt_jax.robots import Robot
-from vrrt_jax.robots.sources import mesh_spec
+from vrrt_jax.robots.kinematics import link_poses
+from vrrt_jax.robots.mesh_sources import mesh_spec
+from vrrt_jax.scene.obstacles import signed_distances
+from vrrt_jax.scene.world import World, obstacle_list
 from vrrt_jax.splat.camera import project, shrunk
-from vrrt_jax.splat.goal import prepare_goal
+from vrrt_jax.splat.images import prepare_goal
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.raster import render
 from vrrt_jax.splat.types import Camera, SplatModel

@@ -13,13 +13,13 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from nrp_jax.exact import ExactScene
-from nrp_jax.grid import Grid, load_map
-from nrp_jax.robots import MobileRobot, load_robot
-from nrp_jax.world import batch_is_free, build_world
-from vrrt_jax.core.kinematics import batch_link_poses
-from vrrt_jax.core.rrt import sample_configurations
+from nrp_jax.homes.grid import Grid, load_map
+from nrp_jax.scene.exact import ExactScene
+from nrp_jax.scene.robots import MobileRobot, load_robot
+from nrp_jax.scene.world import batch_is_free, build_world
+from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.timing import best_ms, machine
+from vrrt_jax.robots.kinematics import batch_link_poses
 
 BATCH = 1024
 
@@ -181,7 +181,7 @@ def add_arguments(subparsers) -> None:
 
 
 def _run_command(arguments: argparse.Namespace) -> int:
-    from nrp_jax.houses import generate_house
+    from nrp_jax.homes.houses import generate_house
 
     results = {}
     for name in ("snake", "fetch"):

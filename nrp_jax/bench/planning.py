@@ -10,13 +10,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from nrp_jax.data import Settings, home_seed
-from nrp_jax.difficulty import EXPANSIONS, MIN_GEODESIC, fair_house, long_queries
-from nrp_jax.exact import ExactScene
-from nrp_jax.houses import CELLS
+from nrp_jax.homes.houses import CELLS
+from nrp_jax.learning.data import Settings, home_seed
+from nrp_jax.learning.difficulty import EXPANSIONS, MIN_GEODESIC, fair_house, long_queries
 from nrp_jax.planner import KINDS, METHODS, PlanResult, Status, plan
-from nrp_jax.robots import MobileRobot, load_robot
-from nrp_jax.world import GridWorld, build_world
+from nrp_jax.scene.exact import ExactScene
+from nrp_jax.scene.robots import MobileRobot, load_robot
+from nrp_jax.scene.world import GridWorld, build_world
 from vrrt_jax.core.search import uninterrupted
 from vrrt_jax.core.timing import machine
 

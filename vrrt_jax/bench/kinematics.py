@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from vrrt_jax.core.kinematics import link_poses
-from vrrt_jax.core.mjx_backend import mjx_is_free, mjx_world
 from vrrt_jax.core.timing import best_ms, interleaved_ms
-from vrrt_jax.core.types import Obstacle
-from vrrt_jax.core.world import build_world, is_free
 from vrrt_jax.robots import load_robot
+from vrrt_jax.robots.kinematics import link_poses
+from vrrt_jax.scene.mjx import mjx_is_free, mjx_world
+from vrrt_jax.scene.obstacles import Obstacle
+from vrrt_jax.scene.world import build_world, is_free
 
 NO_FUSION_EMITTERS = {"xla_cpu_use_fusion_emitters": False}
 

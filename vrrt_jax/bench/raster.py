@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.kinematics import link_poses
 from vrrt_jax.core.timing import interleaved_ms
 from vrrt_jax.robots import Robot, load_robot
+from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.splat.camera import look_at
 from vrrt_jax.splat.loss import image_loss
 from vrrt_jax.splat.raster import choose_windows, map_lanes, render

@@ -14,8 +14,8 @@ from vrrt_jax.core.search import make_stop, search
 from vrrt_jax.core.timing import interleaved_ms
 from vrrt_jax.core.types import Expansion
 from vrrt_jax.problems import Problem, load_problem, problem_names
-from vrrt_jax.sight import Sight, visual_setup
-from vrrt_jax.visual import plant
+from vrrt_jax.visual.goal import Sight, visual_setup
+from vrrt_jax.visual.policy import plant
 
 
 def run(repeats: int = 15, seeds: int = 3) -> dict:

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.edges import into_limits
-from vrrt_jax.core.types import Obstacle
-from vrrt_jax.core.verify import contacts, verify_path
-from vrrt_jax.core.world import World, batch_is_free, build_world, obstacle_list
 from vrrt_jax.problems import load_world
 from vrrt_jax.robots import Robot, load_robot
+from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 from vrrt_jax.robots.robot import workspace
-from vrrt_jax.robots.sources import install_hint, mesh_spec
+from vrrt_jax.scene.obstacles import Obstacle
+from vrrt_jax.scene.verify import contacts, verify_path
+from vrrt_jax.scene.world import World, batch_is_free, build_world, obstacle_list
 from vrrt_jax.splat.camera import orbit
 from vrrt_jax.splat.mujoco_images import MeshRenderer
 from vrrt_jax.splat.types import Camera

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from vrrt_jax.core.types import Obstacle
-from vrrt_jax.core.verify import contacts
 from vrrt_jax.robots import Robot
 from vrrt_jax.robots.robot import workspace
+from vrrt_jax.scene.obstacles import Obstacle
+from vrrt_jax.scene.verify import contacts
 
 COUNT = (5, 10)  # obstacles, beside the floor
 KINDS = ("box", "sphere", "capsule", "cylinder")

@@ -95,27 +95,6 @@ class Expansion:
     blocked: jax.Array  # (B,) bool, something lies on the edge
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Obstacle:
-    """An obstacle as the host sees it: one primitive geom of an MJCF file."""
-
-    name: str
-    kind: str  # sphere, box, capsule, cylinder or plane
-    position: tuple[float, float, float]  # in the world [m]
-    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # wxyz
-    size: tuple[float, float, float] = (0.0, 0.0, 0.0)  # as MuJoCo's geom size [m]
-    rgba: tuple[float, float, float, float] = (0.6, 0.6, 0.65, 1.0)
-
-
-@pytree
-class Spheres:
-    """Collision spheres bound to links."""
-
-    link: jax.Array  # (n,) i32
-    centre: jax.Array  # (n, 3) in the link's frame [m]
-    radius: jax.Array  # (n,) [m]
-
-
 class ExpansionPolicy(Protocol[Payload]):
     """A planner: a pytree whose arrays are traced, so that a new goal never re-compiles."""
 

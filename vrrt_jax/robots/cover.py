@@ -14,8 +14,8 @@ import numpy as np
 import optax
 from scipy.spatial import KDTree
 
+from vrrt_jax.robots.convex_parts import Piece, grow, surface_samples, union_depth
 from vrrt_jax.robots.mjcf import joint_ranges
-from vrrt_jax.robots.pieces import Piece, grow, surface_samples, union_depth
 
 MAX_SPHERES = 8  # of one body
 _STARTS = 8

@@ -5,11 +5,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vrrt_jax.robots import cover, text, thin
+from vrrt_jax.robots import cover, mjcf_writer, thin
+from vrrt_jax.robots.convex_parts import collision_pieces, contain_surface
+from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 from vrrt_jax.robots.pairs import allowed_pairs, sample_self_collisions
-from vrrt_jax.robots.pieces import collision_pieces, contain_surface
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.robots.sources import install_hint, mesh_spec
 
 _CONFIGURATIONS = 100_000  # for self-collision
 _LEAF = 3e-4  # [m]
@@ -65,7 +65,7 @@ def fit_spheres(
     found = sample_self_collisions(model, _CONFIGURATIONS, rng)
     allowed = allowed_pairs(model, found)
     write = functools.partial(
-        text.collision_mjcf,
+        mjcf_writer.collision_mjcf,
         model,
         name=robot.name,
         cover=_collect({body: proven[body] for body in moving}),
@@ -90,8 +90,8 @@ def _comment(name: str, num_spheres: int, num_base_spheres: int, seed: int) -> s
 """
 
 
-def _collect(spheres: dict[int, tuple[np.ndarray, np.ndarray]]) -> text.BodySpheres:
-    return text.BodySpheres(
+def _collect(spheres: dict[int, tuple[np.ndarray, np.ndarray]]) -> mjcf_writer.BodySpheres:
+    return mjcf_writer.BodySpheres(
         body=np.repeat(list(spheres), [len(radii) for _, radii in spheres.values()]),
         centre=np.vstack([centres for centres, _ in spheres.values()]),
         radius=np.hstack([radii for _, radii in spheres.values()]),

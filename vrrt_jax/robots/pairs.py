@@ -6,7 +6,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from vrrt_jax.robots import text
+from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.mjcf import joint_ranges
 
 _NUM_DRAFT = 500
@@ -17,12 +17,12 @@ def checked_pairs(model: mujoco.MjModel) -> np.ndarray:
     """Pairs of thin spheres that C MuJoCo checks in a collision model.
 
     Args:
-        model: compiled from :func:`vrrt_jax.robots.text.collision_mjcf`.
+        model: compiled from :func:`vrrt_jax.robots.mjcf_writer.collision_mjcf`.
 
     Returns:
         (P, 2) i32 indices among the thin spheres, in the order of the geoms.
     """
-    geoms = np.flatnonzero(model.geom_group == int(text.THIN["group"]))
+    geoms = np.flatnonzero(model.geom_group == int(mjcf_writer.THIN["group"]))
     body = model.geom_bodyid[geoms]
     first, second = np.triu_indices(len(geoms), 1)
     weld = model.body_weldid[body]
@@ -110,7 +110,7 @@ def always_touching(model: mujoco.MjModel) -> list[tuple[str, str]]:
     """Pairs of bodies whose thin spheres touch at home, or nearly everywhere.
 
     Args:
-        model: compiled from :func:`vrrt_jax.robots.text.collision_mjcf`.
+        model: compiled from :func:`vrrt_jax.robots.mjcf_writer.collision_mjcf`.
     """
     found = sample_self_collisions(model, _NUM_DRAFT, np.random.default_rng(0))
     data = mujoco.MjData(model)

@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from vrrt_jax.core.kinematics import Chain, batch_link_poses, chain_from_model
-from vrrt_jax.core.types import Spheres
-from vrrt_jax.robots import mjcf, pairs, spheres, text, thin
-from vrrt_jax.robots.paths import robot_names, robot_path
+from vrrt_jax.robots import mjcf, mjcf_writer, pairs, spheres, thin
+from vrrt_jax.robots.kinematics import Chain, Spheres, batch_link_poses, chain_from_model
+from vrrt_jax.robots.packaged import robot_names, robot_path
 
 _NUM_SAMPLES = 20_000  # configurations, to see which bodies never touch
 
@@ -73,14 +72,16 @@ def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None =
     mesh_source = str(path.resolve())
     name = str(name_or_path) if str(name_or_path) in robot_names() else path.stem
     if found.origin == "written":  # they stand for the robot of another file, which this one names
-        mesh_source, fixed_before = text.source_of(spec)
+        mesh_source, fixed_before = mjcf_writer.source_of(spec)
         name, frozen = spec.modelname, fixed_before | frozen
     fields = {
         "name": name,
         "mesh_source": mesh_source,
         "frozen": frozen,
     }
-    write = functools.partial(text.collision_mjcf, model, cover=found.cover, home=home, **fields)
+    write = functools.partial(
+        mjcf_writer.collision_mjcf, model, cover=found.cover, home=home, **fields
+    )
     thin_spheres = found.thin
     if found.origin != "written":
         sample = pairs.sample_self_collisions(model, _NUM_SAMPLES, np.random.default_rng(0))
@@ -137,7 +138,7 @@ def _robot(*, model: mujoco.MjModel, **fields) -> Robot:
     chain, body_link, body_in_link = chain_from_model(model)
     lower, upper = mjcf.joint_ranges(model)
     labels = {}
-    for label, group in (("cover", text.COVER), ("thin", text.THIN)):
+    for label, group in (("cover", mjcf_writer.COVER), ("thin", mjcf_writer.THIN)):
         geoms = np.flatnonzero(model.geom_group == int(group["group"]))
         bodies = model.geom_bodyid[geoms]
         centre = np.einsum("nij,nj->ni", body_in_link[bodies, :3, :3], model.geom_pos[geoms])

@@ -6,8 +6,8 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from vrrt_jax.robots import text
-from vrrt_jax.robots.pieces import (
+from vrrt_jax.robots import mjcf_writer
+from vrrt_jax.robots.convex_parts import (
     Piece,
     collision_pieces,
     contain_surface,
@@ -26,8 +26,8 @@ _RELATIVE_BULGE = 0.1  # of the extent of the body, if that is less
 class RobotSpheres:
     """The spheres of a robot."""
 
-    cover: text.BodySpheres  # cover the moving bodies
-    thin: text.BodySpheres  # for self-collision, on all bodies
+    cover: mjcf_writer.BodySpheres  # cover the moving bodies
+    thin: mjcf_writer.BodySpheres  # for self-collision, on all bodies
     # "written" by fit_spheres, with the pairs to ignore; the file's "own"; or "fitted" just now:
     # then the thin ones cover their bodies too, and are too large for self-collision
     origin: Literal["written", "own", "fitted"]
@@ -51,7 +51,9 @@ def spheres_of(model: mujoco.MjModel) -> RobotSpheres:
         )
     if np.any(model.geom_type[geoms] != mujoco.mjtGeom.mjGEOM_SPHERE):
         return _fitted(model)
-    is_cover, is_thin = (_is_kind(model, geoms, kind) for kind in (text.COVER, text.THIN))
+    is_cover, is_thin = (
+        _is_kind(model, geoms, kind) for kind in (mjcf_writer.COVER, mjcf_writer.THIN)
+    )
     has_kinds = bool(np.all(is_cover | is_thin))
     if not has_kinds:
         is_cover = is_thin = np.ones(len(geoms), bool)
@@ -71,8 +73,8 @@ def _is_kind(model: mujoco.MjModel, geoms: np.ndarray, kind: dict[str, str]) -> 
     )
 
 
-def _select(model: mujoco.MjModel, geoms: np.ndarray) -> text.BodySpheres:
-    return text.BodySpheres(
+def _select(model: mujoco.MjModel, geoms: np.ndarray) -> mjcf_writer.BodySpheres:
+    return mjcf_writer.BodySpheres(
         body=model.geom_bodyid[geoms],
         centre=model.geom_pos[geoms],
         radius=model.geom_size[geoms, 0],
@@ -98,8 +100,10 @@ def _fitted(model: mujoco.MjModel) -> RobotSpheres:
     owners, centres, radii = np.hstack(body), np.vstack(centre), np.hstack(radius)
     moves = model.body_weldid[owners] != 0
     return RobotSpheres(
-        cover=text.BodySpheres(body=owners[moves], centre=centres[moves], radius=radii[moves]),
-        thin=text.BodySpheres(body=owners, centre=centres, radius=radii),
+        cover=mjcf_writer.BodySpheres(
+            body=owners[moves], centre=centres[moves], radius=radii[moves]
+        ),
+        thin=mjcf_writer.BodySpheres(body=owners, centre=centres, radius=radii),
         origin="fitted",
     )
 

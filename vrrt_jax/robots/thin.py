@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import optax
 
-from vrrt_jax.robots import text
+from vrrt_jax.robots import mjcf_writer
+from vrrt_jax.robots.convex_parts import STEP
 from vrrt_jax.robots.pairs import SelfCollisions, checked_pairs
-from vrrt_jax.robots.pieces import STEP
 
 _MISS_COST = 20.0  # false alarms that one missed self-collision is worth
 _STEPS = 600
@@ -23,11 +23,11 @@ _NEAR = 0.005  # [m] free configurations with more room between spheres teach no
 
 def refine(
     model: mujoco.MjModel,
-    spheres: text.BodySpheres,
+    spheres: mjcf_writer.BodySpheres,
     found: SelfCollisions,
     allowed: list[tuple[str, str]],
     write: Callable[..., str],
-) -> text.BodySpheres:
+) -> mjcf_writer.BodySpheres:
     """Give covering spheres radii that agree with the true geometry in self-collision.
 
     Args:
@@ -35,7 +35,7 @@ def refine(
         spheres: to start from, on all bodies and sorted by body.
         found: random configurations of ``model``.
         allowed: pairs of bodies that may touch.
-        write: :func:`vrrt_jax.robots.text.collision_mjcf` but for ``thin`` and ``allowed``.
+        write: :func:`vrrt_jax.robots.mjcf_writer.collision_mjcf` but for ``thin`` and ``allowed``.
 
     Returns:
         Those of the spheres that are checked against any other, with new radii.
@@ -44,7 +44,7 @@ def refine(
     truth = np.array([bool(touching - banned) for touching in found.touching])
     draft = mujoco.MjModel.from_xml_string(write(thin=spheres, allowed=allowed))
     radii, is_used = _fit_radii(draft, found.q, truth)
-    return text.BodySpheres(
+    return mjcf_writer.BodySpheres(
         body=spheres.body[is_used],
         centre=spheres.centre[is_used],
         radius=np.round(radii[is_used] / STEP) * STEP,
@@ -64,7 +64,7 @@ def _fit_radii(
     Returns:
         Radii (n,) [m]; (n,) bool, which spheres are checked against any other.
     """
-    geoms = np.flatnonzero(draft.geom_group == int(text.THIN["group"]))
+    geoms = np.flatnonzero(draft.geom_group == int(mjcf_writer.THIN["group"]))
     start = draft.geom_size[geoms, 0]
     pairs = checked_pairs(draft)
     is_used = np.isin(np.arange(len(geoms)), pairs)

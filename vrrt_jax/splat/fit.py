@@ -21,10 +21,10 @@ from scipy.cluster.vq import kmeans2
 from tqdm import tqdm
 
 from vrrt_jax.core.files import replacing
-from vrrt_jax.core.kinematics import body_links, link_poses
-from vrrt_jax.core.world import batch_is_free, build_world
+from vrrt_jax.robots.kinematics import body_links, link_poses
+from vrrt_jax.robots.mesh_sources import mesh_file
 from vrrt_jax.robots.robot import workspace
-from vrrt_jax.robots.sources import mesh_file
+from vrrt_jax.scene.world import batch_is_free, build_world
 from vrrt_jax.splat.camera import cut, orbit, project, shrunk, stack_cameras
 from vrrt_jax.splat.loss import image_loss, psnr_db
 from vrrt_jax.splat.model import Level, SelfModel, save_self_model

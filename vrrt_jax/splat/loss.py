@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from vrrt_jax.core.kinematics import Chain, link_poses
+from vrrt_jax.robots.kinematics import Chain, link_poses
 from vrrt_jax.splat.raster import Windows, render
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import mujoco
 import numpy as np
 
-from vrrt_jax.core.types import Obstacle
+from vrrt_jax.scene.obstacles import Obstacle
 from vrrt_jax.splat.types import Camera
 
 SUPERSAMPLING = 2  # rendered pixels per pixel and axis; the mean of a block is a pixel

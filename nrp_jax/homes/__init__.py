@@ -1,0 +1,1 @@
+"""Homes: occupancy grids, read from files or generated."""

@@ -1,0 +1,1 @@
+"""How samplers learn: data from an expert, networks, training."""

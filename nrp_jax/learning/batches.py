@@ -1,0 +1,257 @@
+"""Rows of a data set as arrays on the device, and batches of them as the networks see them.
+
+Rows are grouped by query, so that a window is cut and encoded once for all its waypoints.
+Letters: ``Q`` queries, ``W`` waypoints of a query, ``H`` homes, ``n`` queries of a batch.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nrp_jax.homes.grid import RESOLUTION, Grid
+from nrp_jax.homes.houses import CELLS
+from nrp_jax.learning import features, local_map
+from nrp_jax.learning.data import Dataset
+from nrp_jax.learning.expert import POSITIVE
+from nrp_jax.learning.models import ModelConfig
+from nrp_jax.scene.field import Field, make_field
+from nrp_jax.scene.robots import MobileRobot, batch_link_features
+from vrrt_jax.core.types import pytree
+
+
+@pytree
+class Examples:
+    """Training rows on the device."""
+
+    maps: jax.Array  # (H, X + 40, Y + 40, Z) float16, see :func:`surrounding_map`
+    home: jax.Array  # (Q,) i32
+    q: jax.Array  # (Q, 2 + W, D) start, goal and waypoints in the world
+    points: jax.Array  # (Q, 2 + W, F, 3) their link frames [m]
+    target: jax.Array  # (Q, W) how good each waypoint is, 0 to 1
+    weight: jax.Array  # (Q, W) of the row in the loss, 0 where a query has fewer waypoints
+
+
+@pytree
+class Batch:
+    """What the networks see of n queries."""
+
+    image: jax.Array  # (n, X, Y, Z)
+    start: jax.Array  # (n, E)
+    goal: jax.Array  # (n, E')
+    waypoints: jax.Array  # (n, W, E'')
+    relation: jax.Array  # (n, W, R), see :func:`relations`
+    target: jax.Array  # (n, W)
+    weight: jax.Array  # (n, W)
+
+
+def surrounding_map(config: ModelConfig, field: Field) -> jax.Array:
+    """A field's map as the images are cut from it: (X + 40, Y + 40, Z), bordered by solid cells.
+
+    Distances to obstacles [m]; for the published models occupancies.
+    """
+    distances = features.surroundings(field)
+    half = local_map.SIDE // 2
+    border = ((half, half), (half, half), (0, 0))
+    distances = jnp.pad(distances, border)
+    return jnp.where(distances > 0, 0.0, 1.0) if config.paper else distances
+
+
+def view(
+    config: ModelConfig, padded: jax.Array, q: jax.Array, resolution: jax.Array, origin: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """What a model sees from a start ``q`` (D,): an image, and the place of its middle.
+
+    Args:
+        config: of the model; its scope says whether it sees a window or the whole map.
+        padded: from :func:`surrounding_map`.
+        q: (D,) start.
+        resolution: () side of a cell [m].
+        origin: (2,) corner of the map's first cell [m].
+
+    Returns:
+        The image (X', Y', Z); the origin (2,) of the local frame [m].
+    """
+    if config.scope == "window":
+        image = local_map.window(padded, q, resolution, origin)
+        return image, local_map.centre(q, resolution, origin)
+    side, half = CELLS[config.task], local_map.SIDE // 2
+    size = np.array(padded.shape[:2]) - 2 * half
+    excess = np.maximum(side - size, 0)  # maps may be smaller, or larger and then are cut
+    solid = 1.0 if config.paper else 0.0
+    image = jnp.pad(
+        padded[half:-half, half:-half],
+        [(excess[0] // 2, excess[0] - excess[0] // 2)]
+        + [(excess[1] // 2, excess[1] - excess[1] // 2), (0, 0)],
+        constant_values=solid,
+    )
+    first = np.maximum(size - side, 0) // 2
+    image = image[first[0] : first[0] + side, first[1] : first[1] + side]
+    corner = first - excess // 2
+    return image, origin[:2] + (jnp.asarray(corner) + side / 2) * resolution
+
+
+def load_examples(
+    config: ModelConfig, robot: MobileRobot, dataset: Dataset, *, soft: bool = True
+) -> Examples:
+    """The rows of a data set that a model learns from.
+
+    A discriminator learns from all, a CVAE from good waypoints alone.
+
+    Args:
+        config: of the model to train.
+        robot: whose configurations they are.
+        dataset: from :func:`nrp_jax.learning.data.load_dataset`.
+        soft: a discriminator's target falls off with the detour; otherwise it is 0 or 1.
+
+    Raises:
+        ValueError: the data set is of another task.
+    """
+    if dataset.settings.task != config.task:
+        raise ValueError(
+            f"the data set is of task '{dataset.settings.task}', the model of '{config.task}'; "
+            "give another data set, or the other --task"
+        )
+    rows = dataset.rows
+    good = rows["ratio"] <= POSITIVE
+    if config.kind == "cvae":
+        rows = {name: column[good] for name, column in rows.items()}
+        target = weight = np.ones(good.sum())
+    else:
+        detour = np.maximum(rows["ratio"] - 1.0, 0.0)
+        target = np.exp(-detour / (POSITIVE - 1.0)) if soft else good.astype(np.float32)
+        weight = np.ones(len(good))
+    grids = [grid.flatten() if robot.planar else grid for grid in dataset.grids]
+    return make_examples(config, robot, grids, rows, target=target, weight=weight)
+
+
+def make_examples(
+    config: ModelConfig,
+    robot: MobileRobot,
+    grids: Sequence[Grid],
+    rows: dict[str, np.ndarray],
+    *,
+    target: np.ndarray,
+    weight: np.ndarray,
+) -> Examples:
+    """Put rows on the device, grouped by query.
+
+    Args:
+        config: of the model to train.
+        robot: whose configurations they are.
+        grids: H homes, planar for a planar robot; their maps begin at (0, 0).
+        rows: ``q_start``, ``q_goal``, ``waypoint`` (n, D), ``home`` and ``query`` (n,).
+        target: (n,) how good the waypoints are.
+        weight: (n,) in the loss.
+    """
+    maps = _stack([surrounding_map(config, make_field(grid)) for grid in grids], config)
+    _, first, group, counts = np.unique(
+        rows["home"].astype(np.int64) << 32 | rows["query"].astype(np.int64),
+        return_index=True,
+        return_inverse=True,
+        return_counts=True,
+    )
+    order = np.argsort(group, kind="stable")
+    slot = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+    table = np.repeat(first[:, None], counts.max(), axis=1)  # empty slots repeat the first row
+    table[group[order], slot] = order
+    filled = np.arange(counts.max()) < counts[:, None]
+    ends = np.stack([rows["q_start"][first], rows["q_goal"][first]], axis=1)
+    q = np.concatenate([ends, rows["waypoint"][table]], axis=1).astype(np.float32)
+    # Once for all rows: kinematics inside the training step would take longest of all to compile.
+    points = batch_link_features(robot, q.reshape(-1, q.shape[-1]))
+    return Examples(
+        maps=jnp.asarray(maps),
+        home=jnp.asarray(rows["home"][first], jnp.int32),
+        q=jnp.asarray(q),
+        points=points.reshape(*q.shape[:2], *points.shape[1:]),
+        target=jnp.asarray(target[table], jnp.float32),
+        weight=jnp.asarray(weight[table] * filled, jnp.float32),
+    )
+
+
+def _stack(maps: list[jax.Array], config: ModelConfig) -> np.ndarray:
+    """Maps of several sizes as one array, filled up with solid cells."""
+    size = np.max([one.shape for one in maps], axis=0)
+    stacked = np.full((len(maps), *size), 1.0 if config.paper else 0.0, np.float16)
+    for k, one in enumerate(maps):
+        stacked[k, : one.shape[0], : one.shape[1], : one.shape[2]] = np.asarray(one)
+    return stacked
+
+
+def make_batch(
+    config: ModelConfig,
+    robot: MobileRobot,
+    examples: Examples,
+    chosen: jax.Array,
+    key: jax.Array | None = None,
+) -> Batch:
+    """Images and features of chosen queries (n,); with a key each is turned and mirrored at random.
+
+    Homes have no preferred direction, so every query stands for eight.
+    """
+    image, q, points = jax.vmap(lambda index: _local(config, examples, index))(chosen)
+    if key is not None:
+        symmetry = jax.random.randint(key, (2, len(chosen)), 0, jnp.array([[4], [2]]))
+        quarter, mirror = symmetry[0], symmetry[1] == 1
+        image = jax.vmap(features.turn_image)(image, quarter, mirror)
+        q = jax.vmap(lambda *a: features.turn_configuration(robot, *a))(q, quarter, mirror)
+        points = jax.vmap(features.turn_points)(points, quarter, mirror)
+    described = describe(config, robot, q, points)
+    return Batch(
+        image=image,
+        start=described[:, 0],
+        goal=jax.vmap(lambda q, p: features.goal_features(config, robot, q, p))(
+            q[:, 1], points[:, 1]
+        ),
+        waypoints=described[:, 2:],
+        relation=jax.vmap(functools.partial(relations, robot))(image, q, points),
+        target=examples.target[chosen],
+        weight=examples.weight[chosen],
+    )
+
+
+def describe(config: ModelConfig, robot: MobileRobot, q: jax.Array, points: jax.Array) -> jax.Array:
+    """Features (n, C, E) of local configurations (n, C, D) with link frames (n, C, F, 3)."""
+    one = functools.partial(features.configuration_features, config, robot)
+    return jax.vmap(jax.vmap(one))(q, points)
+
+
+def _local(config: ModelConfig, examples: Examples, index: jax.Array):
+    """Image, configurations (2 + W, D) and link frames of one query, in its local frame."""
+    home, q, points = examples.home[index], examples.q[index], examples.points[index]
+    if config.scope == "window":
+        image = local_map.stacked_window(examples.maps, home, q[0])
+        centre = local_map.centre(q[0])
+    else:
+        image, centre = view(
+            config, examples.maps[home], q[0], jnp.float32(RESOLUTION), jnp.zeros(2)
+        )
+    points = points - jnp.append(centre, 0.0)
+    return image.astype(jnp.float32), features.to_local(q, centre), points
+
+
+def relations(robot: MobileRobot, image: jax.Array, q: jax.Array, points: jax.Array) -> jax.Array:
+    """How candidates lie to their surroundings and to the ends.
+
+    Args:
+        robot: whose configurations they are.
+        image: (X, Y, Z) around the start.
+        q: (2 + C, D) start, goal and candidates, local.
+        points: (2 + C, F, 3) their link frames [m].
+
+    Returns:
+        (C, R): what the image holds along the way from the start, at last where the candidate
+        stands; steps of base and arm from the start and to the goal.
+    """
+    standing = jax.vmap(functools.partial(features.standing_points, robot))(q, points)
+    passed = jax.vmap(features.passed_points, (None, 0))(standing[0], standing[2:])
+    parts = [read(image, passed), *(features.steps(robot, q[2:], end) for end in q[:2])]
+    return jnp.concatenate(parts, axis=-1)
+
+
+def read(image: jax.Array, points: jax.Array) -> jax.Array:
+    """What an image (X, Y, Z) holds at local points (..., 3) [m], (...)."""
+    return image.reshape(-1)[features.cells(points, image.shape, RESOLUTION)]

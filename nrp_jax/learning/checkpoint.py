@@ -1,0 +1,93 @@
+"""Trained models on disk: one ``.npz`` of arrays and a description, written all at once."""
+
+import dataclasses
+import json
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import flax.traverse_util
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nrp_jax.learning.models import CVAE, Discriminator, ModelConfig
+from vrrt_jax.core.files import replacing
+
+VERSION = 2  # of what the networks see, see :mod:`nrp_jax.learning.features`
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Model:
+    """A trained model."""
+
+    config: ModelConfig
+    variables: Any  # flax variables: params, and batch_stats of the published models
+    info: dict[str, Any]  # how it was trained, how well it did
+
+    @property
+    def module(self) -> Discriminator | CVAE:
+        """The flax module that the variables belong to."""
+        return build_module(self.config, self.info["num_outputs"])
+
+
+def build_module(config: ModelConfig, num_outputs: int) -> Discriminator | CVAE:
+    """The flax module of a configuration; a CVAE writes ``num_outputs`` features."""
+    return Discriminator(config) if config.kind == "discriminator" else CVAE(config, num_outputs)
+
+
+def save_model(model: Model, path: str | Path) -> None:
+    """Write a model; a killed process leaves the former file or the new one."""
+    path = Path(path)
+    flat = flax.traverse_util.flatten_dict(jax.device_get(model.variables), sep="/")
+    arrays: dict[str, Any] = {
+        f"variables/{name}": np.asarray(leaf, np.float16) for name, leaf in flat.items()
+    }
+    config = dataclasses.asdict(model.config)
+    description = json.dumps({"version": VERSION, "config": config, "info": model.info})
+    with replacing(path) as handle:
+        np.savez_compressed(handle, description=np.array(description), **arrays)
+
+
+def load_model(path: str | Path) -> Model:
+    """Read a model that :func:`save_model` wrote.
+
+    Raises:
+        ValueError: there is none, it cannot be read, or it is of another architecture.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "model.npz"
+    if not path.is_file():
+        raise ValueError(f"no model at '{path}'; train one with: nrp train")
+    try:
+        with np.load(path) as saved:
+            description = json.loads(str(saved["description"]))
+            if description["version"] != VERSION:
+                raise ValueError("another version")
+            flat = {
+                name.removeprefix("variables/"): jnp.asarray(saved[name], jnp.float32)
+                for name in saved.files
+                if name != "description"
+            }
+        given = description["config"].items()
+        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given}
+        config, info = ModelConfig(**fields), description["info"]
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error):
+        raise ValueError(
+            f"'{path}' is not a readable model of this version; train it again with: nrp train"
+        ) from None
+    variables = flax.traverse_util.unflatten_dict(flat, sep="/")
+    return Model(config=config, variables=variables, info=info)
+
+
+def check_model(model: Model, path: str | Path, **expected: str) -> None:
+    """Raise a ValueError unless the model's configuration holds the expected values."""
+    for name, value in expected.items():
+        got = getattr(model.config, name)
+        if got != value:
+            raise ValueError(
+                f"'{path}' holds a model with {name} '{got}'; expected '{value}': give another "
+                "file, or train one with: nrp train"
+            )

@@ -1,0 +1,171 @@
+"""What the networks see of configurations: exact kinematics, in a frame at the start's base.
+
+Frame and goal encoding after Lu et al. 2024; angles are given by cosine and sine, so that there is
+no jump at half a turn. Letters: ``D`` joints, ``E`` features.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nrp_jax.learning.models import ModelConfig
+from nrp_jax.scene.field import Field
+from nrp_jax.scene.robots import MobileRobot
+from vrrt_jax.core.edges import short_way
+
+FAR = 6.0  # goals farther than this look as if they were this far [m]
+CLEAR = 1.0  # distances to obstacles beyond this do not matter [m]
+WAY = 4  # places along an edge at which the surroundings are read
+HEADING = 2  # the joint that turns the whole robot, for both robots
+
+
+def to_local(q: jax.Array, centre: jax.Array) -> jax.Array:
+    """Configurations (..., D) in the frame at a place (..., 2) of the map [m]; no rotation."""
+    return jnp.concatenate([q[..., :2] - centre, q[..., 2:]], axis=-1)
+
+
+def to_world(q: jax.Array, centre: jax.Array) -> jax.Array:
+    """The inverse of :func:`to_local`."""
+    return jnp.concatenate([q[..., :2] + centre, q[..., 2:]], axis=-1)
+
+
+def configuration_features(
+    config: ModelConfig, robot: MobileRobot, q: jax.Array, points: jax.Array
+) -> jax.Array:
+    """Features (E,) of one local configuration (D,): joints, then link frames.
+
+    The published models see angles [rad], the others their cosines and sines.
+
+    Args:
+        config: of the model.
+        robot: whose configuration it is.
+        q: (D,) in the local frame.
+        points: (F, 3) from :func:`nrp_jax.link_features` [m]; heights only if it is not planar.
+    """
+    if config.paper:
+        joints = q
+    else:
+        is_angle = np.array(robot.angular)
+        angle = q[is_angle]
+        joints = jnp.concatenate([q[~is_angle], jnp.cos(angle), jnp.sin(angle)])
+    return jnp.concatenate([joints, (points[:, :2] if robot.planar else points).reshape(-1)])
+
+
+def goal_features(
+    config: ModelConfig, robot: MobileRobot, q: jax.Array, points: jax.Array
+) -> jax.Array:
+    """Features (E',) of one local goal (D,): as above, and where it lies.
+
+    The published models add the direction; the others bring far goals to ``FAR`` and add direction
+    and the logarithm of the distance.
+    """
+    place = q[:2]
+    if config.paper:
+        direction = jnp.arctan2(place[1], place[0])
+        return jnp.append(configuration_features(config, robot, q, points), direction)
+    distance = jnp.sqrt(jnp.sum(place**2) + 1e-6)
+    back = place * (jnp.minimum(1.0, FAR / distance) - 1.0)
+    q, points = q.at[:2].add(back), points.at[:, :2].add(back)
+    features = configuration_features(config, robot, q, points)
+    return jnp.concatenate([features, place / distance, jnp.log(distance)[None]])
+
+
+def to_configuration(config: ModelConfig, robot: MobileRobot, features: jax.Array) -> jax.Array:
+    """The local configuration (..., D) that generated features (..., E) begin with."""
+    num = len(robot.joint_names)
+    if config.paper:
+        return features[..., :num]
+    is_angle = np.array(robot.angular)
+    linear, cosine, sine = jnp.split(
+        features[..., : num + is_angle.sum()], [num - is_angle.sum(), num], axis=-1
+    )
+    order = np.argsort(np.concatenate([np.flatnonzero(~is_angle), np.flatnonzero(is_angle)]))
+    return jnp.concatenate([linear, jnp.arctan2(sine, cosine)], axis=-1)[..., order]
+
+
+def standing_points(robot: MobileRobot, q: jax.Array, points: jax.Array) -> jax.Array:
+    """Where a local configuration (D,) stands: its link frames (F, 3) and its base, (P, 3) [m]."""
+    heights = jnp.array([0.0] if robot.planar else [0.1, 0.5, 0.9])
+    base = jnp.append(q[:2], 0.0) + heights[:, None] * jnp.array([0.0, 0.0, 1.0])
+    return jnp.concatenate([points, base])
+
+
+def passed_points(start: jax.Array, end: jax.Array) -> jax.Array:
+    """Points (WAY * P, 3) near the way of points from their start (P, 3) to their end (P, 3) [m].
+
+    They go straight here, as they nearly do where the posture changes little.
+    """
+    fraction = jnp.arange(1, WAY + 1)[:, None, None] / WAY
+    return (start + fraction * (end - start)).reshape(-1, 3)
+
+
+def cells(points: jax.Array, shape: tuple[int, ...], resolution: float) -> jax.Array:
+    """Flat indices (...) of the cells of a window (X, Y, Z) that hold local points (..., 3)."""
+    flat = jnp.int32(0)
+    for axis, middle in enumerate((shape[0] // 2, shape[1] // 2, 0)):
+        if shape[axis] > 1:  # axis by axis: XLA's CPU loops over a last axis of three are slow
+            index = jnp.floor(points[..., axis] * (1.0 / resolution)).astype(jnp.int32) + middle
+            flat = flat * shape[axis] + jnp.clip(index, 0, shape[axis] - 1)
+    return flat
+
+
+def steps(robot: MobileRobot, q: jax.Array, end: jax.Array) -> jax.Array:
+    """How far base and arm are apart (..., 2) in configurations (..., D) and (D,) [m] and [rad]."""
+    squared = short_way(q - end, robot.wraps) ** 2
+    base, arm = squared[..., :2].sum(-1), squared[..., robot.base_dim :].sum(-1)
+    return jnp.sqrt(jnp.stack([base, arm], axis=-1) + 1e-12)
+
+
+def surroundings(field: Field) -> jax.Array:
+    """The map (X, Y, Z) behind a field: distances to obstacles at each cell's middle [m].
+
+    Distances beyond ``CLEAR`` count as that; solid cells hold 0.
+    """
+    planar = field.values.shape[2] == 1
+    fine = field.fine
+    first = fine + fine // 2  # the field has a rim of one cell in x and y
+    inside = field.values[first:-first:fine, first:-first:fine]
+    return jnp.minimum(inside if planar else inside[:, :, fine // 2 :: fine], CLEAR)
+
+
+def turn_image(image: jax.Array, quarter: jax.Array, mirror: jax.Array) -> jax.Array:
+    """Turn an image (X, Y, Z), X = Y, by quarter turns from x to y, after mirroring y if asked."""
+    image = jnp.where(mirror, image[:, ::-1], image)
+    turns = [lambda image, k=k: jnp.rot90(image, k) for k in range(4)]
+    return jax.lax.switch(quarter, turns, image)
+
+
+def turn_configuration(
+    robot: MobileRobot, q: jax.Array, quarter: jax.Array, mirror: jax.Array
+) -> jax.Array:
+    """Turn local configurations (..., D) together with the image: see :func:`turn_image`.
+
+    The snake's joints count clockwise from +y, the Fetch's heading counts from +x to +y.
+    """
+    if robot.planar:
+        sign = np.array([1, -1, *[-1] * 6])
+        offset = np.array([0, 0, np.pi, *[0] * 5])
+        clockwise = -1
+    else:
+        mirrored = ("y", "theta", "shoulder_pan", "upperarm_roll", "forearm_roll", "wrist_roll")
+        sign = np.array([-1 if name.startswith(mirrored) else 1 for name in robot.joint_names])
+        offset = np.zeros(len(sign))
+        clockwise = 1
+    q = jnp.where(mirror, sign * q + offset, q)
+    heading = q[..., HEADING] + clockwise * quarter * (jnp.pi / 2)
+    heading = jnp.mod(heading + jnp.pi, 2 * jnp.pi) - jnp.pi
+    return _turn(q.at[..., HEADING].set(heading), quarter)
+
+
+def turn_points(points: jax.Array, quarter: jax.Array, mirror: jax.Array) -> jax.Array:
+    """Turn local points (..., 3) together with the image: see :func:`turn_image`."""
+    sign = jnp.where(mirror, jnp.array([1.0, -1.0, 1.0]), 1.0)
+    return _turn(sign * points, quarter)
+
+
+def _turn(place: jax.Array, quarter: jax.Array) -> jax.Array:
+    """Turn the first two of (..., k) numbers by quarter turns from the first to the second."""
+    cosine = jnp.array([1.0, 0.0, -1.0, 0.0])[quarter]
+    sine = jnp.array([0.0, 1.0, 0.0, -1.0])[quarter]
+    x, y = place[..., 0], place[..., 1]
+    return place.at[..., 0].set(cosine * x - sine * y).at[..., 1].set(sine * x + cosine * y)

@@ -1,0 +1,309 @@
+"""Training of the discriminator and the CVAE."""
+
+import argparse
+import dataclasses
+import functools
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import scipy.stats
+from tqdm import tqdm
+
+from nrp_jax.learning import models
+from nrp_jax.learning.batches import Batch, Examples, load_examples, make_batch
+from nrp_jax.learning.checkpoint import Model, build_module, save_model
+from nrp_jax.learning.data import fingerprint, load_dataset
+from nrp_jax.learning.models import ModelConfig
+from nrp_jax.learning.training_io import Keeper, State, claim, plot_curves, waited, write_log
+from nrp_jax.scene.robots import MobileRobot, load_robot
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """How a model is trained."""
+
+    epochs: int = 60
+    batch: int = 64  # queries a step
+    learning_rate: float = 2e-3  # at its peak; then a cosine down to nothing
+    weight_decay: float = 1e-3
+    patience: int = 12  # epochs without a better validation loss, then training ends
+    augment: bool = True  # turn and mirror
+    validation: float = 0.15  # share of the homes that is held out
+    seed: int = 0
+
+
+def train(
+    config: ModelConfig,
+    robot: MobileRobot,
+    examples: Examples,
+    out: str | Path,
+    *,
+    settings: TrainConfig = TrainConfig(),
+    stamp: str = "",
+    progress: bool = True,
+) -> Model:
+    """Train a model; an interrupted training goes on where its last whole epoch ended.
+
+    Args:
+        config: the architecture.
+        robot: whose configurations the examples hold.
+        examples: from :func:`nrp_jax.learning.batches.load_examples`.
+        out: folder for ``model.npz`` (the best epoch), ``log.csv``, ``curves.png`` and
+            ``checkpoint/`` (the last epoch).
+        settings: of the optimiser.
+        stamp: names the data; a training goes on only with the same.
+        progress: show a bar.
+
+    Returns:
+        The model of the best epoch.
+
+    Raises:
+        ValueError: ``out`` holds a training of another model, data or settings, or there are too
+            few homes to hold some out.
+        RuntimeError: the validation loss is not finite any more.
+    """
+    parts = {"model": dataclasses.asdict(config), "settings": dataclasses.asdict(settings)}
+    training, validation = split_by_home(np.asarray(examples.home), settings)
+    out = claim(Path(out), {**parts, "data": stamp})
+    sample = make_batch(config, robot, examples, jnp.zeros(1, jnp.int32))
+    module = build_module(config, sample.waypoints.shape[-1])
+    size = min(settings.batch, len(training))
+    steps = settings.epochs * (len(training) // size)
+    schedule = optax.warmup_cosine_decay_schedule(
+        0.0, settings.learning_rate, min(200, steps // 10 + 1), steps + 1
+    )
+    optimiser = optax.adamw(schedule, weight_decay=settings.weight_decay)
+    variables = init(config, module, sample, jax.random.key(settings.seed))
+    state = State(
+        variables=variables,
+        optimiser=optimiser.init(variables["params"]),
+        step=jnp.int32(0),
+    )
+    keeper = Keeper(out / "checkpoint")
+    state, best, history = keeper.restore(state)
+
+    def export() -> Model:
+        figures = min(history, key=lambda row: row["loss"])
+        info = {"num_outputs": sample.waypoints.shape[-1], "data": stamp, "best": figures}
+        model = Model(config=config, variables=best, info=info)
+        save_model(model, out / "model.npz")
+        return model
+
+    @jax.jit
+    def update(state: State, examples: Examples, chosen: jax.Array):
+        key, key_turn = jax.random.split(
+            jax.random.fold_in(jax.random.key(settings.seed), state.step)
+        )
+        batch = make_batch(config, robot, examples, chosen, key_turn if settings.augment else None)
+
+        def objective(params):
+            variables = {**state.variables, "params": params}
+            return loss_fn(config, module, variables, batch, key, train=True)
+
+        (loss, (_, changed)), gradient = jax.value_and_grad(objective, has_aux=True)(
+            state.variables["params"]
+        )
+        updates, moments = optimiser.update(gradient, state.optimiser, state.variables["params"])
+        params = optax.apply_updates(state.variables["params"], updates)
+        variables = {**state.variables, **changed, "params": params}
+        return State(variables=variables, optimiser=moments, step=state.step + 1), loss
+
+    bar = tqdm(
+        range(len(history), settings.epochs),
+        initial=len(history),
+        total=settings.epochs,
+        desc=f"{config.task} {config.kind}",
+        unit="epoch",
+        disable=not progress,
+    )
+    for epoch in bar:
+        if waited(history) >= settings.patience:
+            break
+        started = time.perf_counter()
+        order = np.random.default_rng([settings.seed, epoch]).permutation(training)
+        losses = []
+        for chosen in order[: len(order) // size * size].reshape(-1, size):
+            state, loss = update(state, examples, jnp.asarray(chosen))
+            losses.append(loss)
+        figures = validate(config, module, robot, state.variables, examples, validation)
+        if not np.isfinite(figures["loss"]):
+            keeper.close()
+            raise RuntimeError(
+                f"training diverged in epoch {epoch}: the best epoch before is kept in '{out}'; "
+                "lower --learning-rate and choose another folder with --out"
+            )
+        history.append(
+            {
+                "epoch": epoch,
+                "train_loss": float(np.mean(jax.device_get(losses))),
+                **figures,
+                "seconds": round(time.perf_counter() - started, 2),
+            }
+        )
+        if waited(history) == 0:
+            best = jax.device_get(state.variables)
+            export()
+        finished = len(history) == settings.epochs or waited(history) >= settings.patience
+        keeper.save(state, best, history, last=finished)
+        write_log(history, out)
+        bar.set_postfix_str(f"loss {figures['loss']:.4f}, quality {figures['quality']:.3f}")
+    keeper.close()
+    model = export()
+    try:
+        plot_curves(history, out / "curves.png", f"{config.task} {config.kind}")
+    except ModuleNotFoundError:
+        print("no curves: matplotlib is missing; pip install 'vrrt-jax[plot]'", file=sys.stderr)
+    return model
+
+
+def init(config: ModelConfig, module: nn.Module, batch: Batch, key: jax.Array) -> dict[str, Any]:
+    """Random variables of a module."""
+    last = batch.relation if config.kind == "discriminator" else key
+    return jax.jit(module.init)(key, batch.image, batch.start, batch.goal, batch.waypoints, last)
+
+
+def loss_fn(
+    config: ModelConfig,
+    module: nn.Module,
+    variables: dict[str, Any],
+    batch: Batch,
+    key: jax.Array,
+    train: bool = False,
+):
+    """The loss () of a batch; with it logits or reconstructions, and changed batch statistics."""
+    last = batch.relation if config.kind == "discriminator" else key
+    inputs = (batch.image, batch.start, batch.goal, batch.waypoints, last)
+    outputs, changed = module.apply(variables, *inputs, train=train, mutable=["batch_stats"])
+    if config.kind == "discriminator":
+        return models.discriminator_loss(outputs, batch.target, batch.weight), (outputs, changed)
+    loss, error, _ = models.cvae_loss(config, batch.waypoints, *outputs, mask=batch.weight)
+    return loss, (error, changed)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _evaluate(config, module, robot, variables, examples, chosen, key):
+    batch = make_batch(config, robot, examples, chosen)
+    loss, (outputs, _) = loss_fn(config, module, variables, batch, key)
+    return loss, outputs, batch.target, batch.weight
+
+
+def validate(
+    config: ModelConfig,
+    module: nn.Module,
+    robot: MobileRobot,
+    variables: dict[str, Any],
+    examples: Examples,
+    chosen: np.ndarray,
+    size: int = 64,
+) -> dict[str, float]:
+    """Loss on chosen queries (n,), and quality.
+
+    Quality is the area under the ROC curve of a discriminator, and minus the reconstruction error
+    of a CVAE.
+    """
+    parts = np.resize(chosen, (-(-len(chosen) // size), size))
+    key = jax.random.key(0)
+    found = [
+        jax.device_get(_evaluate(config, module, robot, variables, examples, part, key))
+        for part in parts
+    ]
+    loss = float(np.mean([part[0] for part in found]))
+    if config.kind == "cvae":
+        return {"loss": loss, "quality": -float(np.mean([part[1] for part in found]))}
+    logits, target, weight = (
+        np.concatenate([part[i].ravel() for part in found]) for i in (1, 2, 3)
+    )
+    return {"loss": loss, "quality": ranking_quality(logits[weight > 0], target[weight > 0])}
+
+
+def ranking_quality(score: np.ndarray, target: np.ndarray) -> float:
+    """Area under the ROC curve: how often a good waypoint scores above a bad one."""
+    good = target > 0.5
+    ranks = scipy.stats.rankdata(score)
+    pairs = max(1, good.sum() * (~good).sum())
+    return float((ranks[good].sum() - good.sum() * (good.sum() + 1) / 2) / pairs)
+
+
+def split_by_home(home: np.ndarray, settings: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of training and of validation queries (Q,): no home is in both.
+
+    Raises:
+        ValueError: all queries are of one home.
+    """
+    homes = np.random.default_rng(settings.seed).permutation(np.unique(home))
+    if len(homes) < 2:
+        raise ValueError("the data are of one home; expected two or more, to hold one out")
+    held_out = homes[: max(1, round(settings.validation * len(homes)))]
+    is_held_out = np.isin(home, held_out)
+    return np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out)
+
+
+def add_arguments(subparsers: Any) -> None:
+    """Add the ``train`` command to a command line."""
+    parser = subparsers.add_parser("train", help="train a sampler, or go on training it")
+    parser.set_defaults(run=_run_command)
+    parser.add_argument("--task", required=True, choices=models.TASKS, help="whose sampler")
+    parser.add_argument("--model", required=True, choices=models.KINDS, help="which sampler")
+    parser.add_argument("--paper", action="store_true", help="the published architecture")
+    parser.add_argument(
+        "--global", dest="whole_map", action="store_true", help="see the whole map, not a window"
+    )
+    parser.add_argument("--data", required=True, help="folder that nrp data wrote")
+    parser.add_argument("--out", required=True, help="folder for the model, log and curves")
+    parser.add_argument("--epochs", type=int, default=TrainConfig.epochs, help="at most")
+    parser.add_argument("--batch", type=int, default=TrainConfig.batch, help="queries a step")
+    parser.add_argument(
+        "--learning-rate", type=float, default=TrainConfig.learning_rate, help="at its peak"
+    )
+    parser.add_argument(
+        "--patience", type=int, default=TrainConfig.patience, help="epochs without progress"
+    )
+    parser.add_argument("--hard", action="store_true", help="labels 0 and 1, none between")
+    parser.add_argument("--seed", type=int, default=TrainConfig.seed, help="of weights and batches")
+
+
+def _run_command(arguments: argparse.Namespace) -> int:
+    make = ModelConfig.published if arguments.paper else ModelConfig.default
+    config = make(arguments.task, arguments.model, "map" if arguments.whole_map else "window")
+    settings = TrainConfig(
+        epochs=arguments.epochs,
+        batch=arguments.batch,
+        learning_rate=arguments.learning_rate,
+        patience=arguments.patience,
+        seed=arguments.seed,
+    )
+    check_settings(settings)
+    robot = load_robot(arguments.task)
+    dataset = load_dataset(arguments.data)
+    soft = not arguments.hard
+    examples = load_examples(config, robot, dataset, soft=soft)
+    stamp = f"{fingerprint(arguments.data)}, {len(dataset)} rows, soft {soft}"
+    try:
+        model = train(config, robot, examples, arguments.out, settings=settings, stamp=stamp)
+    except KeyboardInterrupt:
+        print(f"the same command goes on from the last epoch in {arguments.out}")
+        raise
+    figures = ", ".join(f"{name} {value:.4g}" for name, value in model.info["best"].items())
+    print(f"wrote {Path(arguments.out) / 'model.npz'}: {figures}")
+    return 0
+
+
+def check_settings(settings: TrainConfig) -> None:
+    """Raise a ValueError that names the setting out of range."""
+    for name, low, high in (
+        ("epochs", 1, 100_000),
+        ("batch", 1, 65_536),
+        ("learning_rate", 1e-8, 1.0),
+        ("patience", 1, 100_000),
+        ("seed", 0, 2**31),
+    ):
+        value = getattr(settings, name)
+        if not low <= value <= high:
+            raise ValueError(f"{name} is {value}; expected {low} to {high}")

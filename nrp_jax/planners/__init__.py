@@ -1,0 +1,1 @@
+"""Planners for homes beside those of the kernel, one a file."""

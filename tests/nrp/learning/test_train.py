@@ -1,0 +1,138 @@
+"""Training on a small data set with a real rule behind it."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from nrp_synthetic import synthetic_rows
+
+from nrp_jax.learning import train as training
+from nrp_jax.learning.batches import load_examples, make_batch, make_examples
+from nrp_jax.learning.checkpoint import load_model
+from nrp_jax.learning.models import ModelConfig
+from nrp_jax.learning.train import TrainConfig, check_settings, split_by_home, train
+
+SETTINGS = TrainConfig(epochs=16, batch=48, patience=16)
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return synthetic_rows(homes=6, queries=80, waypoints=6)
+
+
+def examples_of(config, rows):
+    robot, grids, columns = rows
+    good = columns["good"].astype(np.float32)
+    if config.kind == "cvae":
+        columns = {name: column[good > 0] for name, column in columns.items()}
+        good = good[good > 0]
+    return robot, make_examples(
+        config, robot, grids, columns, target=good, weight=np.ones(len(good))
+    )
+
+
+def test_rows_of_a_query_stay_together(rows):
+    config = ModelConfig.default("snake", "cvae")
+    robot, examples = examples_of(config, rows)
+    columns, good = rows[2], rows[2]["good"]
+    assert float(examples.weight.sum()) == good.sum()
+    for k in range(0, len(examples.home), 37):
+        same = (columns["q_start"] == np.asarray(examples.q[k, 0])).all(1) & good
+        kept = np.asarray(examples.q[k, 2:])[np.asarray(examples.weight[k]) > 0]
+        np.testing.assert_array_equal(kept, columns["waypoint"][same])
+
+
+def test_homes_are_held_out_whole():
+    home = np.repeat(np.arange(20), 7)
+    training, validation = split_by_home(home, SETTINGS)
+    assert not set(home[training]) & set(home[validation])
+    assert len(set(home[validation])) == 3 and len(training) + len(validation) == len(home)
+    with pytest.raises(ValueError, match="of one home"):
+        split_by_home(np.zeros(5), SETTINGS)
+
+
+def test_the_discriminator_learns_and_goes_on_after_a_kill(rows, tmp_path, monkeypatch, capsys):
+    """It learns what is free in unseen homes; a killed run ends as an unbroken one."""
+    config = ModelConfig.default("snake", "discriminator")
+    robot, examples = examples_of(config, rows)
+    model = train(config, robot, examples, tmp_path / "a", settings=SETTINGS, progress=False)
+    assert model.info["best"]["quality"] > 0.85
+    with open(tmp_path / "a" / "log.csv") as handle:
+        log = list(csv.DictReader(handle))
+    assert [int(row["epoch"]) for row in log] == list(range(16))
+    assert (tmp_path / "a" / "curves.png").stat().st_size > 5000
+
+    def without_matplotlib(*_):
+        raise ModuleNotFoundError("No module named 'matplotlib'")
+
+    monkeypatch.setattr(training, "plot_curves", without_matplotlib)
+    same = train(config, robot, examples, tmp_path / "a", settings=SETTINGS, progress=False)
+    assert same.info["best"] == model.info["best"] and "no curves" in capsys.readouterr().err
+
+    # The same in a process of its own, which is killed while it trains.
+    process = subprocess.Popen(
+        [sys.executable, __file__, tmp_path / "b"],
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(sys.path),
+            "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),
+        },
+    )
+    deadline = time.monotonic() + 200
+    while not (tmp_path / "b" / "log.csv").exists() and process.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert load_model(tmp_path / "b").config == config
+    again = train(config, robot, examples, tmp_path / "b", settings=SETTINGS, progress=False)
+    assert again.info["best"]["epoch"] == model.info["best"]["epoch"]
+    for a, b in zip(*(jax.tree.leaves(m.variables) for m in (model, again)), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4)
+    with pytest.raises(ValueError, match="holds a training of another model"):
+        train(config, robot, examples, tmp_path / "a", settings=TrainConfig(), progress=False)
+
+
+def test_a_diverged_training_keeps_the_best_epoch(rows, tmp_path, monkeypatch):
+    config = ModelConfig.default("snake", "discriminator")
+    robot, examples = examples_of(config, rows)
+    losses = iter([0.5, 0.4, np.nan])
+    monkeypatch.setattr(training, "validate", lambda *_: {"loss": next(losses), "quality": 0.5})
+    with pytest.raises(RuntimeError, match="diverged in epoch 2: .* lower --learning-rate"):
+        train(config, robot, examples, tmp_path, settings=SETTINGS, progress=False)
+    assert load_model(tmp_path).info["best"]["epoch"] == 1
+    assert len((tmp_path / "log.csv").read_text().splitlines()) == 3
+    assert not (tmp_path / "checkpoint" / "3").exists()
+
+
+def test_the_generator_learns(rows, tmp_path):
+    config = ModelConfig.default("snake", "cvae")
+    robot, examples = examples_of(config, rows)
+    model = train(config, robot, examples, tmp_path, settings=SETTINGS, progress=False)
+    batch = make_batch(config, robot, examples, np.arange(len(examples.home)))
+    spread = np.asarray(batch.waypoints)[np.asarray(batch.weight) > 0].var(axis=0).mean()
+    assert -model.info["best"]["quality"] < 0.9 * spread
+
+
+def test_settings_and_data_of_another_task_are_refused():
+    with pytest.raises(ValueError, match="epochs is 0; expected 1 to"):
+        check_settings(TrainConfig(epochs=0))
+
+    class Other:
+        settings = type("Settings", (), {"task": "fetch"})
+
+    with pytest.raises(ValueError, match="data set is of task 'fetch', the model of 'snake'"):
+        load_examples(ModelConfig.default("snake", "cvae"), None, Other())  # type: ignore
+
+
+if __name__ == "__main__":
+    config = ModelConfig.default("snake", "discriminator")
+    found = examples_of(config, synthetic_rows(homes=6, queries=80, waypoints=6))
+    train(config, *found, Path(sys.argv[1]), settings=SETTINGS, progress=False)

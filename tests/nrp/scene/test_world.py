@@ -1,0 +1,345 @@
+"""Maps, distance fields and configuration checks in homes."""
+
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nrp_jax
+from nrp_jax.bench import checks
+from nrp_jax.bench.checks import SphereLoop
+from nrp_jax.homes.grid import coarsened, load_map
+from nrp_jax.scene.exact import ExactScene, merge_cells
+from nrp_jax.scene.field import make_field, room
+from vrrt_jax.core.edges import free_steps
+from vrrt_jax.core.planners.rrt import sample_configurations
+
+MAPS = Path(os.environ.get("NRP_MAPS", "maps-are-elsewhere"))
+
+
+def cluttered(rng, shape, share=0.04):
+    occupied = rng.random(shape) < share
+    occupied[2:5, 2:5] = False
+    return nrp_jax.Grid(occupied=occupied, origin=(-1.0, 0.5, 0.0))
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    """Both robots among random cells: (robot, grid, world)."""
+    rng = np.random.default_rng(0)
+    snake, fetch = nrp_jax.load_robot("snake"), nrp_jax.load_robot("fetch")
+    flat, tall = cluttered(rng, (40, 30, 1)), cluttered(rng, (50, 40, 20), 0.002)
+    return {
+        "snake": (snake, flat, nrp_jax.build_world(snake, flat)),
+        "fetch": (fetch, tall, nrp_jax.build_world(fetch, tall)),
+    }
+
+
+def distance_to_cells(grid, points):
+    """Exact distances (n,) from points (n, 3) to the solid cells, and to what is beside the map."""
+    dims = 2 if grid.planar else 3
+    low = np.argwhere(grid.occupied) * grid.resolution + grid.origin
+    gap = np.maximum(low - points[:, None], points[:, None] - low - grid.resolution)
+    near = np.linalg.norm(np.maximum(gap[..., :dims], 0), axis=2).min(axis=1)
+    first, last = np.array(grid.origin), grid.origin + grid.size
+    beside = np.minimum(points - first, last - points)[:, :2].min(axis=1)
+    return np.minimum(near, np.maximum(beside, 0))
+
+
+@pytest.mark.parametrize("name", ["snake", "fetch"])
+def test_room_is_a_close_lower_bound(worlds, rng, name):
+    _, grid, _ = worlds[name]
+    low, high = np.array(grid.origin), grid.origin + grid.size
+    points = rng.uniform(low - 0.2, high + 0.2, (4000, 3))
+    exact = distance_to_cells(grid, points)
+    found = np.asarray(room(make_field(grid), jnp.asarray(points.T, jnp.float32)))
+    assert np.all(found <= exact + 1e-5)
+    between = (exact > 0) & (points[:, 2] > low[2]) & (points[:, 2] < high[2])
+    assert np.mean(exact[between] - found[between]) < (0.006 if grid.planar else 0.03)
+
+
+@pytest.mark.parametrize("name", ["snake", "fetch"])
+def test_no_collision_is_missed(worlds, name):
+    """Against an exact loop over the same spheres and against C MuJoCo with the primitives."""
+    robot, grid, world = worlds[name]
+    q = np.asarray(sample_configurations(world, jax.random.key(0), 1024))
+    free = np.asarray(nrp_jax.batch_is_free(world, q))
+    loop, scene = SphereLoop(robot, grid), ExactScene(robot, grid)
+    by_loop = np.array([loop.is_free(row) for row in q])
+    by_mujoco = np.array([scene.touching(row) is None for row in q])
+    assert 0.03 < free.mean() < 0.9
+    assert not np.any(free & ~by_loop)
+    assert not np.any(free & ~by_mujoco)
+    assert np.mean(~free & by_loop) < (0.02 if name == "snake" else 0.05)  # false alarms
+    assert np.mean(~free & by_mujoco) < (0.04 if name == "snake" else 0.08)
+
+
+def test_planar_boxes_stand_where_the_snake_is():
+    occupied = np.zeros((40, 40), bool)
+    occupied[20:22] = True
+    grid = nrp_jax.Grid(occupied=occupied, origin=(0.0, 0.0, -2.0))
+    scene = ExactScene(nrp_jax.load_robot("snake"), grid)
+    q = np.array([1.0, 1.0, 0.6, 1.0, -0.8, 1.0, -0.8, 0.9])
+    assert scene.touching(q) is None
+    for x in (2.1, 4.1):  # the wall, and what is beside the map
+        q[0] = x
+        assert "touches the map" in (scene.touching(q) or "")
+
+
+def test_rates_of_fewer_configurations_than_a_batch(worlds, monkeypatch):
+    monkeypatch.setattr(checks, "_rate", lambda num, *_: float(num))
+    robot, grid, _ = worlds["snake"]
+    rates = checks.run(robot, grid, num=100)["checks_per_s"]
+    assert rates == {"batched": 100, "sphere_loop": 100, "mujoco": 100}
+    with pytest.raises(ValueError, match="num is 0; expected at least 1"):
+        checks.run(robot, grid, num=0)
+
+
+def test_outside_the_map_all_is_solid(worlds):
+    for robot, grid, _ in worlds.values():
+        clear = nrp_jax.Grid(occupied=np.zeros((40, 40, 20)), origin=grid.origin)
+        empty = nrp_jax.build_world(robot, clear)
+        q = np.zeros((5, robot.num_joints), np.float32)
+        q[:, 3 if robot.planar else 5] = 1.0 if robot.planar else -1.0
+        if not robot.planar:
+            q[:, 3] = 0.2
+        middle = np.array(grid.origin[:2]) + 2.0
+        q[:, :2] = middle + np.array([[0, 0], [2.5, 0], [0, 2.5], [-9, 0], [0, -90]])
+        assert nrp_jax.batch_is_free(empty, q).tolist() == [True, False, False, False, False]
+
+
+def test_the_floor_stops_the_arm():
+    fetch = nrp_jax.load_robot("fetch")
+    world = nrp_jax.build_world(fetch, nrp_jax.Grid(occupied=np.zeros((60, 60, 20))))
+    q = np.zeros((2, 11), np.float32)
+    q[:, :2], q[:, 3] = 3.0, 0.1
+    q[1, 5] = 1.2  # the straight arm points down
+    assert nrp_jax.batch_is_free(world, q).tolist() == [True, False]
+
+
+def test_another_home_does_not_compile_again(worlds):
+    robot, grid, world = worlds["fetch"]
+    q = sample_configurations(world, jax.random.key(1), 1500)
+    before = nrp_jax.batch_is_free(world, q)
+    other = nrp_jax.with_grid(world, nrp_jax.Grid(occupied=~grid.occupied, origin=grid.origin))
+    compiled = nrp_jax.batch_is_free._cache_size()
+    assert not np.any(nrp_jax.batch_is_free(other, q)) and np.any(before)
+    assert nrp_jax.batch_is_free._cache_size() == compiled
+
+
+@pytest.mark.parametrize("name", ["snake", "fetch"])
+def test_edges_and_metric(worlds, name):
+    robot, _, world = worlds[name]
+    q_a, q_b = sample_configurations(world, jax.random.key(2), 64).reshape(2, 32, -1)
+    np.testing.assert_allclose(world.distance(q_a, q_b), world.distance(q_b, q_a), rtol=1e-4)
+    if name == "snake":
+        step = np.array(q_b - q_a)
+        step[:, 2] = (step[:, 2] + np.pi) % (2 * np.pi) - np.pi  # q1 alone wraps
+        base, arm = np.linalg.norm(step[:, :2], axis=1), np.linalg.norm(step[:, 2:], axis=1)
+        np.testing.assert_allclose(world.distance(q_a, q_b), base + 0.167 * arm, rtol=1e-4)
+    ends = [world.interpolate(q_a, q_b, f) for f in (0.0, 1.0)]
+    for end, q in zip(ends, (q_a, q_b), strict=True):
+        apart = np.array(end - q)
+        wraps = np.asarray(world.wraps)
+        apart[:, wraps] = (apart[:, wraps] + np.pi) % (2 * np.pi) - np.pi
+        assert np.abs(apart).max() < 1e-3
+    middle = world.interpolate(q_a, q_b, 0.5)
+    first, second = world.distance(q_a, middle), world.distance(middle, q_b)
+    np.testing.assert_allclose(first + second, world.distance(q_a, q_b), atol=0.01)
+    if name == "snake":  # the Fetch's edges are cut by how far they go or turn
+        np.testing.assert_allclose(first, world.distance(q_a, q_b) / 2, atol=0.01)
+
+
+@pytest.mark.parametrize("name", ["snake", "fetch"])
+def test_no_joint_moves_farther_in_a_sub_step_than_the_resolution(worlds, name):
+    _, _, world = worlds[name]
+    q_a, q_b = sample_configurations(world, jax.random.key(5), 64).reshape(2, 32, -1)
+    num = np.ceil(np.asarray(world.span(world.edge(q_a, q_b))) / float(world.resolution))
+    for start, end, parts in zip(q_a, q_b, num.astype(int), strict=True):
+        fraction = np.minimum(np.arange(200) / parts, 1.0).astype(np.float32)
+        step = np.diff(world.interpolate(start[None], end[None], fraction), axis=0)
+        wraps = np.asarray(world.wraps)
+        step[:, wraps] = (step[:, wraps] + np.pi) % (2 * np.pi) - np.pi
+        assert np.abs(step).max() <= 1.01 * float(world.resolution)
+
+
+@pytest.mark.parametrize("name", ["snake", "fetch"])
+def test_distances_to_nodes_agree_with_the_metric(worlds, name):
+    """The nearest node is right; of the Fetch's, only a shortlist is answered."""
+    _, _, world = worlds[name]
+    nodes = sample_configurations(world, jax.random.key(3), 300)
+    q = sample_configurations(world, jax.random.key(4), 20)
+    among = jnp.ones((20, 300), bool).at[:, ::7].set(False)
+    exact = np.asarray(world.distance(q[:, None], nodes))
+    found = np.asarray(jax.jit(lambda w, *a: w.distances(*a))(world, nodes, q, among))
+    assert np.all(np.isinf(found[:, ::7]))
+    answered = np.isfinite(found)
+    np.testing.assert_allclose(found[answered], exact[answered], atol=1e-3)
+    nearest = np.where(among, exact, np.inf).min(axis=1)
+    np.testing.assert_allclose(found.min(axis=1), nearest, atol=1e-3)
+
+
+def test_free_steps_against_single_checks(worlds):
+    _, _, world = worlds["snake"]
+    q = sample_configurations(world, jax.random.key(5), 400)
+    q = q[np.asarray(nrp_jax.batch_is_free(world, q))][:16]
+    q_from, q_to = q[:8], q[8:16]
+    passed = np.asarray(jax.jit(free_steps, static_argnums=3)(world, q_from, q_to, 64))
+    for a, b, count in zip(q_from, q_to, passed, strict=True):
+        points = world.interpolate(a[None], b[None], jnp.arange(1, 65) / 64)
+        free = np.asarray(nrp_jax.batch_is_free(world, points))
+        assert count == (64 if free.all() else np.argmin(free))
+
+
+def test_merged_cells_are_the_cells(rng):
+    occupied = rng.random((9, 8, 7)) < 0.5
+    rebuilt = np.zeros(occupied.shape, int)
+    boxes = merge_cells(occupied)
+    for low, high in boxes:
+        rebuilt[tuple(map(slice, low, high))] += 1
+    np.testing.assert_array_equal(rebuilt, occupied)
+    assert len(boxes) < occupied.sum()
+
+
+def test_flatten_crop_and_save(tmp_path):
+    occupied = np.zeros((20, 30, 20), bool)
+    occupied[3, 4, 15], occupied[5, 6, 2] = True, True
+    grid = nrp_jax.Grid(occupied=occupied, origin=(1.0, 2.0, 0.0))
+    assert np.argwhere(grid.flatten().occupied).tolist() == [[5, 6, 0]]
+    assert np.argwhere(grid.flatten(1.0, 2.0).occupied).tolist() == [[3, 4, 0]]
+    part = grid.crop((1.5, 2.5), (2.0, 3.0))
+    assert part.occupied.shape == (5, 5, 20) and part.origin == (1.5, 2.5, 0.0)
+    assert np.argwhere(part.occupied).tolist() == [[0, 1, 2]]
+    grid.save(tmp_path / "map.npz")
+    again = load_map(tmp_path / "map.npz")
+    np.testing.assert_array_equal(again.occupied, occupied)
+    assert again.origin == grid.origin and again.resolution == grid.resolution
+
+
+ROS = "image: home.pgm\nresolution: 0.05\norigin: [-1.0, -2.0, 0.0]\noccupied_thresh: 0.65\n"
+
+
+def test_what_lies_below_the_floor_is_in_nobodys_way():
+    robot = nrp_jax.load_robot("fetch")
+    occupied = np.zeros((60, 60, 21), bool)
+    occupied[..., 0] = True  # the floor itself
+    grid = nrp_jax.Grid(occupied=occupied, origin=(0.0, 0.0, -0.1))
+    world = nrp_jax.build_world(robot, grid)
+    q = np.zeros((1, 11), np.float32)
+    q[0, :2], q[0, 3:] = 3.0, [0.2, 1.3, 1.4, -0.2, 1.5, 0.0, 1.66, 0.0]
+    assert nrp_jax.batch_is_free(world, jnp.asarray(q))[0]
+    assert SphereLoop(robot, grid).is_free(q[0])
+    assert not ExactScene(robot, grid).touching(q[0])
+
+
+@pytest.mark.parametrize(
+    ("free_thresh", "negate", "mode"),
+    [(0.196, 0, "trinary"), (0.25, 0, "trinary"), (0.25, 1, "trinary"), (0.25, 0, "scale")],
+)
+def test_ros_map(tmp_path, free_thresh, negate, mode):
+    from PIL import Image
+
+    grey = np.full((40, 61), 254, np.uint8)
+    grey[10, 20], grey[30, 40] = 0, 205  # solid, unknown
+    Image.fromarray(255 - grey if negate else grey).save(tmp_path / "home.pgm")
+    (tmp_path / "home.yaml").write_text(
+        f"{ROS}free_thresh: {free_thresh}\nnegate: {negate}\nmode: {mode}\n"
+    )
+    grid = load_map(tmp_path / "home.yaml")
+    assert grid.occupied.shape == (31, 20, 1) and grid.origin == (-1.0, -2.0, 0.0)
+    assert np.argwhere(grid.occupied[:-1, :, 0]).tolist() == [[10, 14], [20, 4]]
+    assert grid.occupied[-1].all()  # half of it lies beside the map
+
+
+def test_transparent_pixels_of_a_ros_map_are_unknown(tmp_path):
+    from PIL import Image
+
+    pixels = np.full((40, 60, 2), 255, np.uint8)  # grey and alpha
+    pixels[10, 20, 1] = 0
+    Image.fromarray(pixels, "LA").save(tmp_path / "home.png")
+    (tmp_path / "home.yaml").write_text(ROS.replace("pgm", "png"))
+    grid = load_map(tmp_path / "home.yaml")
+    assert np.argwhere(grid.occupied[..., 0]).tolist() == [[10, 14]]
+
+
+def test_ros_maps_of_other_kinds_are_refused(tmp_path):
+    from PIL import Image
+
+    path = tmp_path / "home.yaml"
+    Image.fromarray(np.full((4, 4), 254, np.uint8)).save(tmp_path / "home.pgm")
+    path.write_text(f"{ROS}mode: raw\n")
+    with pytest.raises(ValueError, match="mode is 'raw'; expected .* save the map as trinary"):
+        load_map(path)
+    Image.fromarray(np.full((4, 4), 9000, np.uint16)).save(tmp_path / "home.png")
+    path.write_text(ROS.replace("pgm", "png"))
+    with pytest.raises(ValueError, match="expected 8 bits a pixel"):
+        load_map(path)
+
+
+def test_mjcf_scene_in_cells(tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        "<mujoco><worldbody><geom type='plane' size='5 5 .1'/>"
+        "<geom type='box' pos='1 1 .5' size='.5 .05 .5'/>"
+        "<geom type='sphere' pos='.05 .05 1.05' size='.04'/></worldbody></mujoco>"
+    )
+    grid = load_map(path)
+    low = np.argwhere(grid.occupied) * 0.1 + grid.origin
+    in_box = (low > [0.49, 0.89, -0.01]).all(axis=1)
+    assert grid.occupied.shape[2] == 20
+    assert in_box.sum() == 10 * 2 * 10  # y from 0.95 to 1.05 m meets two layers of cells
+    np.testing.assert_allclose(low[~in_box], [[0.0, 0.0, 1.0]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("occupied", "resolution", "message"),
+    [
+        (np.zeros(5), 0.1, r"shape \(5,\); expected \(X, Y\) or \(X, Y, Z\)"),
+        (np.zeros((0, 5)), 0.1, "with cells in it"),
+        (np.full((4, 4), 0.5), 0.1, "apply a threshold"),
+        (np.zeros((4, 4)), 0.0, "resolution is 0.0"),
+        (np.zeros((4, 4)), np.nan, "resolution is nan"),
+    ],
+)
+def test_bad_maps(occupied, resolution, message):
+    with pytest.raises(ValueError, match=message):
+        nrp_jax.Grid(occupied=occupied, resolution=resolution)
+
+
+def test_a_grid_from_other_kinds_of_arrays():
+    grid = nrp_jax.Grid(occupied=np.eye(4), origin=(1, 2))  # type: ignore
+    assert grid.occupied.shape == (4, 4, 1) and grid.occupied.dtype == bool
+    assert grid.origin == (1.0, 2.0, 0.0) and grid.planar
+    with pytest.raises(ValueError, match=r"origin is \(1.0,\); expected x, y"):
+        nrp_jax.Grid(occupied=np.eye(4), origin=(1.0,))
+
+
+def test_bad_map_files(tmp_path):
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        load_map(tmp_path / "none.npz")
+    (tmp_path / "map.txt").write_text("")
+    with pytest.raises(ValueError, match="unknown kind"):
+        load_map(tmp_path / "map.txt")
+    (tmp_path / "map.npz").write_text("not a zip")
+    with pytest.raises(ValueError, match="not a readable .npz"):
+        load_map(tmp_path / "map.npz")
+    (tmp_path / "map.yaml").write_text("image: none.pgm")
+    with pytest.raises(ValueError, match="image, resolution and origin"):
+        load_map(tmp_path / "map.yaml")
+    with pytest.raises(ValueError, match="cells are 0.3 m"):
+        coarsened(nrp_jax.Grid(occupied=np.zeros((3, 3)), resolution=0.3))
+    with pytest.raises(ValueError, match="needs a map with heights"):
+        flat = nrp_jax.Grid(occupied=np.zeros((30, 30)))
+        nrp_jax.build_world(nrp_jax.load_robot("fetch"), flat)
+
+
+@pytest.mark.skipif(not MAPS.is_dir(), reason="NRP_MAPS names no folder")
+@pytest.mark.parametrize("name", ["home_rls_3d", "house_aws_3d", "home_pal_3d", "house_tb3_3d"])
+def test_maps_from_elsewhere_load(name):
+    grid = load_map(MAPS / f"{name}.npz")
+    world = nrp_jax.build_world(nrp_jax.load_robot("snake"), grid)
+    q = sample_configurations(world, jax.random.key(0), 1500)
+    assert 0.05 < float(np.mean(nrp_jax.batch_is_free(world, q))) < 0.6

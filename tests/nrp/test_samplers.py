@@ -1,0 +1,152 @@
+"""The samplers as planners use them, with random weights; and scores of waypoints."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from nrp_synthetic import free, random_grid
+
+from nrp_jax import samplers
+from nrp_jax.bench import score
+from nrp_jax.homes.grid import Grid
+from nrp_jax.learning.batches import make_batch, make_examples
+from nrp_jax.learning.checkpoint import Model, build_module, save_model
+from nrp_jax.learning.expert import build_roadmap
+from nrp_jax.learning.models import ModelConfig
+from nrp_jax.learning.train import init
+from nrp_jax.scene.robots import load_robot
+from nrp_jax.scene.world import build_world, with_grid
+
+
+def random_model(kind: str, seed: int = 0) -> Model:
+    robot, config = load_robot("snake"), ModelConfig.default("snake", kind)
+    q = np.full((1, 8), 2.0, np.float32)
+    rows = {"q_start": q, "q_goal": q, "waypoint": q, "home": np.zeros(1), "query": np.zeros(1)}
+    grid = random_grid(0)
+    examples = make_examples(config, robot, [grid], rows, target=np.ones(1), weight=np.ones(1))
+    batch = make_batch(config, robot, examples, jnp.zeros(1, jnp.int32))
+    outputs = batch.waypoints.shape[-1]
+    variables = init(config, build_module(config, outputs), batch, jax.random.key(seed))
+    return Model(config=config, variables=variables, info={"num_outputs": outputs})
+
+
+@pytest.fixture(scope="module")
+def models():
+    return {kind: random_model(kind) for kind in ("discriminator", "cvae")}
+
+
+@pytest.fixture(scope="module")
+def world():
+    return build_world(load_robot("snake"), random_grid(5))
+
+
+@pytest.fixture(scope="module")
+def ends(world):
+    rng = np.random.default_rng(0)
+    q = rng.uniform(world.lower, world.upper, (4096, 8)).astype(np.float32)
+    q = q[free(world, q)]
+    return jnp.asarray(q[:32]), jnp.asarray(q[32:64])
+
+
+@pytest.mark.parametrize("kind", ["discriminator", "cvae"])
+def test_waypoints_are_near_and_inside_the_limits(kind, models, world, ends):
+    sampler = samplers.make_sampler(models[kind])
+    compiled = samplers.propose._cache_size()
+    q = samplers.propose(sampler, world, *ends, jax.random.key(0))
+    assert q.shape == (32, 8) and q.dtype == jnp.float32
+    assert bool(jnp.all((q >= world.lower) & (q <= world.upper)))
+    if kind == "discriminator":
+        assert float(jnp.max(jnp.abs(q - ends[0])[:, :2])) <= 2.06
+        assert len(np.unique(np.asarray(q), axis=0)) > 16
+    same = samplers.propose(sampler, world, *ends, jax.random.key(0))
+    np.testing.assert_array_equal(q, same)
+    other = samplers.propose(sampler, world, *ends, jax.random.key(1))
+    assert float(jnp.abs(q - other).max()) > 1e-3
+    # Neither other weights nor another home compile anything.
+    weights = dataclasses.replace(sampler, variables=random_model(kind, 1).variables)
+    elsewhere = with_grid(world, random_grid(6))
+    samplers.propose(weights, elsewhere, *ends, jax.random.key(0))
+    assert samplers.propose._cache_size() == compiled + 1
+
+
+def test_checking_finds_waypoints_that_can_be_reached(models, world, ends):
+    def reached(checked):
+        sampler = samplers.make_sampler(models["discriminator"], candidates=64, checked=checked)
+        q = np.asarray(samplers.propose(sampler, world, *ends, jax.random.key(3)))
+        fraction = np.linspace(0, 1, 24)[:, None, None]
+        edge = np.asarray(ends[0]) + fraction * np.asarray(world.edge(ends[0], q))
+        return free(world, edge.reshape(-1, 8)).reshape(24, 32).all(axis=0).mean()
+
+    assert reached(24) > reached(1) + 0.2
+
+
+def test_a_goal_in_the_window_can_be_the_waypoint(models, world, ends):
+    """Of no candidates but the goal, the goal is the best."""
+    sampler = samplers.make_sampler(models["discriminator"], candidates=0)
+    inwards = 0.5 * jnp.sign(3.0 - ends[0][:, :2])
+    near = ends[1].at[:, :2].set(ends[0][:, :2] + inwards)
+    q = samplers.propose(sampler, world, ends[0], near, jax.random.key(0))
+    np.testing.assert_allclose(q, near, atol=1e-5)
+
+
+def test_weights_of_another_task_or_kind_are_refused(models, tmp_path):
+    save_model(models["cvae"], tmp_path / "model.npz")
+    with pytest.raises(ValueError, match="task 'snake'; expected 'fetch'"):
+        samplers.load_sampler("fetch", "cvae", tmp_path)
+    with pytest.raises(ValueError, match="kind 'cvae'; expected 'discriminator'"):
+        samplers.load_sampler("snake", "discriminator", tmp_path)
+    with pytest.raises(ValueError, match="unknown task 'panda'"):
+        samplers.load_sampler("panda", "cvae")
+    assert samplers.load_sampler("snake", "cvae", tmp_path, checked=4).checked == 4
+
+
+def test_maps_that_do_not_fit_are_left_out(tmp_path, capsys):
+    for name, layers, z in (
+        ("a/map", 20, 0.02),
+        ("b/map", 20, 0.0),
+        ("flat", 1, 0.0),
+        ("high", 20, 0.1),
+        ("low", 19, 0.0),
+    ):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        grid = Grid(occupied=np.zeros((9, 9, layers)), origin=(3.0, -2.0, z))
+        grid.save(tmp_path / f"{name}.npz")
+    tested = {"cvae": samplers.load_sampler("fetch", "cvae")}
+    maps = score._maps(tmp_path, load_robot("fetch"), tested)
+    assert [*maps] == ["a/map.npz", "b/map.npz"]
+    assert maps["a/map.npz"].origin == (0.0, 0.0, 0.02)
+    told = capsys.readouterr().err.splitlines()
+    assert [line.split("'")[1].split("/")[-1] for line in told] == [
+        "flat.npz",
+        "high.npz",
+        "low.npz",
+    ]
+    assert "samplers have seen 20" in told[2] and "begin at z = 0.1 m" in told[1]
+    with pytest.raises(ValueError, match="no maps for fetch in .*; expected .npz"):
+        score._maps(tmp_path / "none", load_robot("fetch"), tested)
+
+
+def test_scores_of_waypoints(world):
+    """The expert's own waypoint scores 1, one behind a wall 0, one off the way in between."""
+    robot = load_robot("snake")
+    roadmap = build_roadmap(world, robot, jax.random.key(0), 500)
+    queries = score.make_queries(world, robot, roadmap, 20, seed=0)
+    best = np.array(
+        [
+            np.argmin(np.where(row > 0, row + queries.cost[goal], np.inf))
+            for row, goal in zip(
+                roadmap.lengths[queries.start].toarray(), queries.goal, strict=True
+            )
+        ]
+    )
+    expert = score.optimality(world, robot, roadmap, queries, roadmap.q[best])
+    np.testing.assert_allclose(expert, 1.0, atol=1e-3)
+    blocked = roadmap.q[best].copy()
+    blocked[:, :2] = -1.0
+    np.testing.assert_array_equal(score.optimality(world, robot, roadmap, queries, blocked), 0.0)
+    rng = np.random.default_rng(0)
+    aside = roadmap.q[queries.start] + rng.uniform(-0.3, 0.3, (20, 8)).astype(np.float32)
+    scores = score.optimality(world, robot, roadmap, queries, aside)
+    assert (scores <= 1).all() and 0 < np.median(scores) < 1

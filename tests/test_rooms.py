@@ -1,0 +1,88 @@
+"""Who may import whom: a room uses only what is below it."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+# From the ground up. A module of a room may import its own room and those before it.
+VRRT_ROOMS = (
+    ("core.types", "core.edges", "core.files", "core.command", "core.timing", "core.parallel"),
+    ("core",),
+    ("robots",),
+    ("scene",),
+    ("splat",),
+    ("config", "checks"),
+    ("visual",),
+    ("planner", "problems"),
+    ("report", "viz"),
+    ("bench",),
+    ("cli",),
+)
+NRP_ROOMS = (
+    ("homes",),
+    ("scene",),
+    ("learning",),
+    ("samplers",),
+    ("planners",),
+    ("planner",),
+    ("viz",),
+    ("bench",),
+    ("cli",),
+)
+FILES = sorted(
+    path.relative_to(ROOT).as_posix()
+    for package in ("vrrt_jax", "nrp_jax")
+    for path in (ROOT / package).rglob("*.py")
+)
+
+
+def imported(file):
+    """Modules that a file imports, at any depth of its code."""
+    for node in ast.walk(ast.parse((ROOT / file).read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file} imports relatively"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def floor(module, rooms):
+    """The index of the room that a module, such as "core.tree", lives in; None if it has none."""
+    for index, names in enumerate(rooms):
+        if any(module == name or module.startswith(f"{name}.") for name in names):
+            return index
+    return None
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_a_room_uses_only_what_is_below_it(file):
+    package, _, inner = file.removesuffix(".py").removesuffix("/__init__").partition("/")
+    rooms = VRRT_ROOMS if package == "vrrt_jax" else NRP_ROOMS
+    here = floor(inner.replace("/", "."), rooms)
+    for module in imported(file):
+        other, _, rest = module.partition(".")
+        if other == package and here is not None and (there := floor(rest, rooms)) is not None:
+            assert there <= here, f"{file} imports {module}, which is above it"
+
+
+def test_vrrt_never_imports_nrp():
+    for file in FILES:
+        if file.startswith("vrrt_jax/"):
+            assert not any(m.split(".")[0] == "nrp_jax" for m in imported(file)), file
+
+
+def test_nrp_takes_the_kernel_the_robots_and_the_scene_from_vrrt():
+    allowed = ("vrrt_jax.core", "vrrt_jax.robots", "vrrt_jax.scene")
+    for file in FILES:
+        if file.startswith("nrp_jax/"):
+            for module in imported(file):
+                assert not module.startswith("vrrt_jax") or module.startswith(allowed), module
+
+
+def test_the_core_knows_neither_robots_nor_images_nor_networks():
+    for file in FILES:
+        if file.startswith("vrrt_jax/core/"):
+            for module in imported(file):
+                assert not module.startswith(("mujoco", "flax", "optax", "scipy")), (file, module)

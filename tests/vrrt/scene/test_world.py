@@ -1,0 +1,172 @@
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import vrrt_jax
+from vrrt_jax.scene.mjx import mjx_is_free, mjx_world
+from vrrt_jax.scene.obstacles import load_obstacles, signed_distances
+from vrrt_jax.scene.world import with_margin
+
+DISTANCE_TOLERANCE = 2e-5  # [m]; worst seen 4e-6, near a plane drawn as a 100 m box
+
+
+def random_obstacles(rng, kinds):
+    quaternions = rng.normal(size=(len(kinds), 4))
+    return [
+        vrrt_jax.Obstacle(
+            name=f"{kind}_{i}",
+            kind=kind,
+            position=tuple(rng.uniform(-0.6, 0.6, 3)),
+            quaternion=tuple(q / np.linalg.norm(q)),
+            size=tuple(rng.uniform(0.05, 0.25, 3)),
+        )
+        for i, (kind, q) in enumerate(zip(kinds, quaternions, strict=True))
+    ]
+
+
+def mujoco_distances(obstacles, points):
+    """Distances of points to obstacles by C MuJoCo, with a tiny sphere as the point."""
+    spec = mujoco.MjSpec()
+    probe = spec.worldbody.add_body(name="probe", mocap=True)
+    probe.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], name="probe")
+    for o in obstacles:
+        kind = getattr(mujoco.mjtGeom, f"mjGEOM_{o.kind.upper()}")
+        size = o.size if o.kind != "plane" else (0, 0, 1)
+        spec.worldbody.add_geom(
+            name=o.name, type=kind, pos=o.position, quat=o.quaternion, size=size
+        )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    found = np.zeros((len(points), len(obstacles)))
+    for i, point in enumerate(points):
+        data.mocap_pos[0] = point
+        mujoco.mj_kinematics(model, data)
+        for k, o in enumerate(obstacles):
+            pair = model.geom("probe").id, model.geom(o.name).id
+            found[i, k] = 1e-3 + mujoco.mj_geomDistance(model, data, *pair, 10.0, None)
+    return found
+
+
+@pytest.mark.parametrize("kind", ["sphere", "box", "capsule", "cylinder", "plane"])
+def test_distance_outside_equals_mujoco(kind, panda, rng):
+    obstacles = random_obstacles(rng, [kind] * 3)
+    world = vrrt_jax.build_world(panda, obstacles)
+    points = rng.uniform(-1, 1, (200, 3))
+    ours = np.asarray(signed_distances(world.obstacles, jnp.asarray(points.T, jnp.float32)))
+    theirs = mujoco_distances(obstacles, points)
+    outside = theirs > 2e-3
+    assert outside.sum() > 50
+    np.testing.assert_allclose(ours[:, :3][outside], theirs[outside], atol=DISTANCE_TOLERANCE)
+    assert np.all(ours[:, :3][theirs < 0] < 2e-3)
+    assert np.all(ours[:, 3:] > 100), "empty slots are far away"
+
+
+def test_is_free_agrees_with_mjx(panda, wall_world, free, rng):
+    q = rng.uniform(panda.lower, panda.upper, (256, 7)).astype(np.float32)
+    # MJX sees cylinders as prisms around them: compare on a world without any.
+    obstacles = [o for o in vrrt_jax.obstacle_list(wall_world) if o.kind != "cylinder"]
+    world = vrrt_jax.with_obstacles(wall_world, obstacles)
+    model, data = mjx_world(panda, world)
+    oracle = jax.jit(
+        jax.vmap(lambda q: mjx_is_free(model, data, q)),
+        compiler_options={"xla_cpu_use_fusion_emitters": False},
+    )
+    ours, theirs = np.asarray(free(world, q)), np.asarray(oracle(q))
+    assert 0.1 < theirs.mean() < 0.9
+    np.testing.assert_array_equal(ours, theirs)
+
+
+def test_margin_makes_it_stricter(panda, wall_world, free, rng):
+    q = rng.uniform(panda.lower, panda.upper, (256, 7)).astype(np.float32)
+    wide = vrrt_jax.build_world(panda, vrrt_jax.obstacle_list(wall_world), margin=0.05)
+    tight_free, wide_free = np.asarray(free(wall_world, q)), np.asarray(free(wide, q))
+    assert np.all(tight_free | ~wide_free)
+    assert tight_free.sum() > wide_free.sum()
+
+
+def test_obstacles_move_without_retracing(panda, wall_world, rng):
+    traces = []
+
+    @jax.jit
+    def clearance(world, q):
+        traces.append(1)
+        return vrrt_jax.obstacle_clearance(world, q)
+
+    q = jnp.asarray(panda.home, jnp.float32)
+    first = clearance(wall_world, q)
+    moved = vrrt_jax.move_obstacle(wall_world, "ball", position=(0.3, 0.0, 0.75), size=(0.2,))
+    other = vrrt_jax.with_obstacles(wall_world, random_obstacles(rng, ["box", "capsule", "sphere"]))
+    empty = vrrt_jax.with_obstacles(wall_world, [])
+    values = [float(clearance(w, q)) for w in (moved, other, empty)]
+    assert len(traces) == 1
+    assert values[0] < float(first) and values[2] > 100
+
+
+def test_more_margin_only_forbids_more_of_obstacles_and_itself(panda, wall_world, free, rng):
+    q = rng.uniform(panda.lower, panda.upper, (2000, 7)).astype(np.float32)
+    for world in (wall_world, vrrt_jax.build_world(panda)):  # the empty one: itself alone
+        now, wary = free(world, q), free(with_margin(world, 0.03), q)
+        assert not np.any(wary & ~now)
+        assert 0 < np.sum(wary) < np.sum(now)
+        np.testing.assert_array_equal(free(with_margin(world, 0.0), q), now)
+
+
+def test_obstacle_list_gives_back_what_went_in(panda, rng):
+    obstacles = random_obstacles(rng, ["sphere", "box", "capsule", "cylinder"])
+    back = vrrt_jax.obstacle_list(vrrt_jax.build_world(panda, obstacles))
+    assert [(o.name, o.kind) for o in back] == [(o.name, o.kind) for o in obstacles]
+    for a, b in zip(obstacles, back, strict=True):
+        used = {"sphere": 1, "box": 3, "capsule": 2, "cylinder": 2}[a.kind]
+        np.testing.assert_allclose(a.position, b.position, atol=1e-6)
+        np.testing.assert_allclose(a.size[:used], b.size[:used], atol=1e-6)
+        assert abs(np.dot(a.quaternion, b.quaternion)) > 1 - 1e-6
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "ellipsoid"}, r"robot's spheres and 'thing' \(ellipsoid\) is not supported"),
+        ({"size": (0.1, -0.1, 0.1)}, "3 positive numbers"),
+        ({"position": (0.0, float("nan"), 0.0)}, "not finite"),
+    ],
+)
+def test_bad_obstacles_are_refused(panda, change, message):
+    fields = {"name": "thing", "kind": "box", "position": (0, 0, 0), "size": (0.1, 0.1, 0.1)}
+    with pytest.raises(ValueError, match=message):
+        vrrt_jax.build_world(panda, [vrrt_jax.Obstacle(**{**fields, **change})])
+
+
+def test_too_many_obstacles_and_unknown_names(panda, wall_world, rng):
+    with pytest.raises(ValueError, match="17 obstacles do not fit into 16 slots"):
+        vrrt_jax.with_obstacles(wall_world, random_obstacles(rng, ["box"] * 17))
+    with pytest.raises(ValueError, match="no obstacle named 'bal'.*'ball'"):
+        vrrt_jax.move_obstacle(wall_world, "bal", position=(0, 0, 0))
+    assert vrrt_jax.build_world(panda, num_slots=9).obstacles.rounding.shape == (16,)
+
+
+def test_world_files(tmp_path):
+    file = tmp_path / "world.xml"
+    file.write_text(
+        "<mujoco><worldbody><body pos='1 0 0'><geom name='e' type='ellipsoid' size='.1 .2 .3'/>"
+        "</body></worldbody></mujoco>"
+    )
+    with pytest.raises(ValueError, match="'e' \\(ellipsoid\\) is not supported"):
+        load_obstacles(file)
+    file.write_text(
+        "<mujoco><worldbody><body pos='1 0 0' quat='0 1 0 0'>"
+        "<geom type='box' size='.1 .2 .3'/></body></worldbody></mujoco>"
+    )
+    (box,) = load_obstacles(file)
+    assert box.position == (1, 0, 0) and box.kind == "box" and box.name == "geom_0"
+    file.write_text(
+        "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    with pytest.raises(ValueError, match="stand still"):
+        load_obstacles(file)
+    file.write_text("<mujoco><worldbo")
+    with pytest.raises(ValueError, match="not a valid MJCF"):
+        load_obstacles(file)
+    with pytest.raises(FileNotFoundError, match="cannot read the world"):
+        load_obstacles(tmp_path / "nowhere.xml")

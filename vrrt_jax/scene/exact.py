@@ -1,0 +1,205 @@
+"""A robot among obstacles in C MuJoCo, with its true meshes where this machine has them."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from vrrt_jax.robots import mjcf_writer
+from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
+from vrrt_jax.robots.robot import Robot
+from vrrt_jax.scene.obstacles import Obstacle
+
+_KINDS = {
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "plane": mujoco.mjtGeom.mjGEOM_PLANE,
+}
+_GEOMETRIES = ("auto", "meshes", "spheres")
+_ALL_BITS = 0x7FFFFFFF
+_SAME_ROBOT = 1e-3  # [m] between the body frames of meshes and of spheres at home
+_OTHER_VERSION = "install the version of the meshes that the README names"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class ExactModel:
+    """A robot and obstacles in C MuJoCo."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    geometry: str  # "meshes" or "spheres"
+    num_bodies: int  # bodies from this index on are obstacles, one each
+    robot_geoms: np.ndarray  # (r,) int, geoms of moving bodies that are checked against obstacles
+    obstacle_geoms: np.ndarray  # (K,) int
+
+    def touching(self, q: np.ndarray) -> list[tuple[int, int]]:
+        """Pairs of bodies, smaller index first, that penetrate each other at ``q`` (D,)."""
+        self.data.qpos[:] = q
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_collision(self.model, self.data)
+        contact = self.data.contact
+        bodies = np.sort(self.model.geom_bodyid[contact.geom[contact.dist < 0]], axis=1)
+        return sorted({(int(first), int(second)) for first, second in bodies})
+
+    def clearance(self, best: float) -> float:
+        """Distance between moving geoms and obstacles where ``touching`` was last asked [m].
+
+        Args:
+            best: no larger distance is of interest [m]; the closer it is, the faster.
+        """
+        model, data = self.model, self.data
+        apart = data.geom_xpos[self.robot_geoms][:, None] - data.geom_xpos[self.obstacle_geoms]
+        bound = np.linalg.norm(apart, axis=-1) - model.geom_rbound[self.obstacle_geoms]
+        is_plane = model.geom_type[self.obstacle_geoms] == mujoco.mjtGeom.mjGEOM_PLANE
+        normal = data.geom_xmat[self.obstacle_geoms].reshape(-1, 3, 3)[:, :, 2]
+        height = np.einsum("rkd,kd->rk", apart, normal)
+        bound = np.where(is_plane, height, bound) - model.geom_rbound[self.robot_geoms, None]
+        for index in np.argsort(bound, axis=None):
+            if bound.flat[index] >= best:
+                break
+            row, column = divmod(int(index), len(self.obstacle_geoms))
+            pair = int(self.robot_geoms[row]), int(self.obstacle_geoms[column])
+            best = min(best, mujoco.mj_geomDistance(model, data, *pair, best, None))
+        return best
+
+    def describe(self, pair: tuple[int, int]) -> str:
+        """Words for a pair of bodies: "link5 touches box_2"."""
+        first, second = (self.model.body(body).name for body in pair)
+        return f"{first} touches {second.removeprefix('obstacle: ')}"
+
+
+def exact_model(
+    robot: Robot, obstacles: Sequence[Obstacle], *, geometry: str = "auto"
+) -> ExactModel:
+    """A compiled model of robot and obstacles; the latest ones are kept.
+
+    Args:
+        robot: from :func:`vrrt_jax.robots.load_robot`.
+        obstacles: K primitives.
+        geometry: as in :func:`verify_path`.
+
+    Raises:
+        ValueError: as :func:`verify_path`.
+    """
+    if geometry not in _GEOMETRIES:
+        raise ValueError(f"geometry is '{geometry}'; expected one of: {', '.join(_GEOMETRIES)}")
+    names = [obstacle.name for obstacle in obstacles]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(
+            f"obstacle names used more than once: {', '.join(twice)}; expected distinct names"
+        )
+    return _build(robot, tuple(_hashable(obstacle) for obstacle in obstacles), geometry)
+
+
+def _hashable(obstacle: Obstacle) -> Obstacle:
+    """The obstacle with tuples of floats, whatever it was made of, and without its colour."""
+    x, y, z = (float(value) for value in obstacle.position)
+    qw, qx, qy, qz = (float(value) for value in obstacle.quaternion)
+    a, b, c = (float(value) for value in obstacle.size)
+    return Obstacle(
+        name=obstacle.name,
+        kind=obstacle.kind,
+        position=(x, y, z),
+        quaternion=(qw, qx, qy, qz),
+        size=(a, b, c),
+    )
+
+
+@functools.lru_cache(maxsize=8)
+def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> ExactModel:
+    spec = None if geometry == "spheres" else mesh_spec(robot, visuals=False)
+    if spec is None and geometry == "meshes":
+        raise ValueError(
+            f"the meshes of robot '{robot.name}' are not on this machine: pip install "
+            f"{install_hint(robot.mesh_source)}, or use geometry='spheres'"
+        )
+    has_meshes = spec is not None
+    spheres = mujoco.MjSpec.from_string(robot.xml)
+    spec = spec or spheres
+    if has_meshes:
+        _check_same_robot(robot, spec.copy().compile(), spheres.compile())
+        _exclude(spec, robot.allowed)
+    num_bodies = len(spec.bodies)
+    for obstacle in obstacles:
+        # spheres of the robot see bit 0 only, so that its thin ones ignore obstacles
+        _add_obstacle(spec, obstacle, _ALL_BITS if has_meshes else 1)
+    spec.memory = 1 << 23  # room for the contacts of a robot deep inside an obstacle
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        reason = "; ".join(str(error).split("\n"))
+        raise ValueError(
+            f"the obstacles do not compile: {reason}; expected sizes as in MJCF, positive"
+        ) from None
+    is_obstacle = model.geom_bodyid >= num_bodies
+    sees_obstacles = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    if not has_meshes:
+        sees_obstacles = model.geom_group == int(mjcf_writer.COVER["group"])
+    is_moving = model.body_weldid[model.geom_bodyid] != 0
+    return ExactModel(
+        model=model,
+        data=mujoco.MjData(model),
+        geometry="meshes" if has_meshes else "spheres",
+        num_bodies=num_bodies,
+        robot_geoms=np.flatnonzero(sees_obstacles & is_moving),
+        obstacle_geoms=np.flatnonzero(is_obstacle),
+    )
+
+
+def _check_same_robot(robot: Robot, meshes: mujoco.MjModel, spheres: mujoco.MjModel) -> None:
+    """Refuse meshes whose joints or body frames are not those of the spheres."""
+    if meshes.nq != robot.num_joints:
+        raise ValueError(
+            f"the meshes of robot '{robot.name}' have {meshes.nq} joints; expected "
+            f"{robot.num_joints}: {_OTHER_VERSION}"
+        )
+    frames = []
+    for model in (meshes, spheres):
+        data = mujoco.MjData(model)
+        data.qpos[:] = robot.home
+        mujoco.mj_kinematics(model, data)
+        frames.append({model.body(k).name: data.xpos[k] for k in range(1, model.nbody)})
+    missing = {*robot.cover_bodies, *robot.thin_bodies} - {"world", *frames[0]}
+    if missing:
+        raise ValueError(
+            f"the meshes of robot '{robot.name}' have no body {', '.join(sorted(missing))}; have: "
+            f"{', '.join(frames[0])}: {_OTHER_VERSION}"
+        )
+    error = max(
+        np.max(np.abs(position - frames[1][name]))
+        for name, position in frames[0].items()
+        if name in frames[1]
+    )
+    if error > _SAME_ROBOT:
+        raise ValueError(
+            f"the meshes of robot '{robot.name}' are placed {error:.4f} m away from its collision "
+            f"spheres; expected the same kinematics: {_OTHER_VERSION}"
+        )
+
+
+def _exclude(spec: mujoco.MjSpec, allowed: Sequence[tuple[str, str]]) -> None:
+    names = {body.name for body in spec.bodies}
+    for first, second in allowed:
+        if first in names and second in names:
+            spec.add_exclude(bodyname1=first, bodyname2=second)
+
+
+def _add_obstacle(spec: mujoco.MjSpec, obstacle: Obstacle, bits: int) -> None:
+    """Add an obstacle as a body of its own, so that contacts can name it."""
+    if obstacle.kind not in _KINDS:
+        raise ValueError(
+            f"obstacle '{obstacle.name}' is a '{obstacle.kind}'; expected one of: "
+            f"{', '.join(_KINDS)}"
+        )
+    size = np.array(obstacle.size)
+    if obstacle.kind == "plane":
+        size[2] = 1.0  # the spacing of the grid that is drawn; zero does not compile
+    body = spec.worldbody.add_body(
+        name=f"obstacle: {obstacle.name}", pos=obstacle.position, quat=obstacle.quaternion
+    )
+    body.add_geom(type=_KINDS[obstacle.kind], size=size, contype=bits, conaffinity=bits)

@@ -1,0 +1,1 @@
+"""Visual-RRT: goals that are images."""
