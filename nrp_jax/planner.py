@@ -18,10 +18,10 @@ from nrp_jax.scene.exact import STEP, ExactScene, Verification, verify
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld, batch_is_free, build_world
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import into_limits, unwrapped
+from vrrt_jax.core.edges import enforce_bounds, unwrapped
 from vrrt_jax.core.planners.rrt import tree_path
 from vrrt_jax.core.planners.rrt_connect import RRTConnect, connection_path
-from vrrt_jax.core.search import SearchResult, Stopped, interruptible, make_stop, search
+from vrrt_jax.core.search import SearchResult, StopReason, interruptible, make_termination, search
 from vrrt_jax.core.shortcut import padded, path_length, shortcut
 from vrrt_jax.core.types import Rejection, Tree
 
@@ -43,12 +43,12 @@ class Status(enum.Enum):
 
 
 _UNSOLVED = {
-    Stopped.REACHED: Status.BUDGET,
-    Stopped.CONVERGED: Status.BUDGET,
-    Stopped.ITERATIONS: Status.BUDGET,
-    Stopped.TREE_FULL: Status.TREE_FULL,
-    Stopped.TIME_LIMIT: Status.TIME_LIMIT,
-    Stopped.INTERRUPTED: Status.INTERRUPTED,
+    StopReason.REACHED: Status.MAX_ITERATIONS,
+    StopReason.CONVERGED: Status.MAX_ITERATIONS,
+    StopReason.ITERATIONS: Status.MAX_ITERATIONS,
+    StopReason.TREE_FULL: Status.TREE_FULL,
+    StopReason.TIME_LIMIT: Status.TIME_LIMIT,
+    StopReason.INTERRUPTED: Status.INTERRUPTED,
 }
 
 
@@ -169,12 +169,12 @@ def plan(
                 policy,
                 tree,
                 key=jax.random.fold_in(key, attempt),
-                stop=make_stop(ARRIVED, max_iterations=iterations),
+                stop=make_termination(ARRIVED, max_iterations=iterations),
                 time_limit_s=left_s,
                 on_progress=on_progress,
             )
             raw = connection_path(found.tree) if method == "rrt-connect" else tree_path(found.tree)
-            reached = raw is not None and found.stopped is Stopped.REACHED
+            reached = raw is not None and found.stopped is StopReason.REACHED
             raw = np.asarray(start)[None] if raw is None else raw
             results.append(_finish(scene, world, found, raw, reached, key, lanes))
             tried += results[-1].expansions
@@ -202,8 +202,10 @@ def check_configuration(
     names = ", ".join(robot.joint_names)
     if q.shape != (robot.num_joints,):
         raise ValueError(f"the {what} has shape {q.shape}; expected ({robot.num_joints},): {names}")
-    lower, upper, wraps = (np.asarray(a) for a in (world.lower, world.upper, world.wraps))
-    bad = ~np.isfinite(q) | (((q < lower - 1e-4) | (q > upper + 1e-4)) & ~wraps)
+    lower, upper, is_continuous = (
+        np.asarray(a) for a in (world.lower, world.upper, world.is_continuous)
+    )
+    bad = ~np.isfinite(q) | (((q < lower - 1e-4) | (q > upper + 1e-4)) & ~is_continuous)
     if bad.any():
         joint = int(np.flatnonzero(bad)[0])
         place = "the map spans" if joint < 2 else "its limits are"
@@ -211,7 +213,7 @@ def check_configuration(
             f"the {what}'s {robot.joint_names[joint]} is {q[joint]}; {place} "
             f"[{lower[joint]:.3f}, {upper[joint]:.3f}]"
         )
-    inside = into_limits(world, jnp.asarray(q))
+    inside = enforce_bounds(world, jnp.asarray(q))
     if not batch_is_free(world, inside[None])[0]:
         raise ValueError(
             f"the {what} touches the map, the floor or the robot itself: {np.round(q, 3).tolist()};"

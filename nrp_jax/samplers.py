@@ -19,7 +19,7 @@ from nrp_jax.learning.local_map import SIDE
 from nrp_jax.learning.models import CVAE, ModelConfig, check_choices
 from nrp_jax.scene.robots import MobileRobot, batch_link_features, load_robot
 from nrp_jax.scene.world import GridWorld
-from vrrt_jax.core.edges import difference, into_limits, points_along
+from vrrt_jax.core.edges import difference, enforce_bounds, points_along
 from vrrt_jax.core.types import pytree, static
 
 REACH = SIDE / 2 * RESOLUTION  # of a window from its middle [m]
@@ -50,7 +50,7 @@ class Discriminator:
     variables: Any
     config: ModelConfig = static()
     candidates: int = static(default=256)  # in whole sixteens
-    judged: int = static(default=96)  # most that the network looks at
+    max_scored: int = static(default=96)  # most that the network looks at
     checked: int = static(default=16)  # of the best, the first whose edge seems free is taken
     edge_checks: int = static(default=12)  # configurations looked at along each of these edges
 
@@ -61,18 +61,18 @@ class Discriminator:
         sight = _look(self.config, self.robot, world, q_from, q_goal)
         q, points = self._candidates(world, q_from, q_goal, key)
         if self.config.scope == "map":  # its frame is the map's, candidates are about the start
-            shift = jnp.pad(features.to_local(q_from, sight.centre)[:, :2], ((0, 0), (0, 1)))
+            shift = jnp.pad(features.to_local(q_from, sight.center)[:, :2], ((0, 0), (0, 1)))
             q = q.at[..., :2].add(shift[:, None, :2])
             points = points + shift[:, None, None]
         q = jnp.concatenate([sight.ends[:, 1:], q], axis=1)
         points = jnp.concatenate([sight.end_points[:, 1:], points], axis=1)
         near = jnp.max(jnp.abs(q_goal - q_from)[:, :2], axis=1) < REACH
         possible = jnp.ones(q.shape[:2], bool).at[:, 0].set(near)
-        if self.config.lookup and self.judged < q.shape[1]:
+        if self.config.lookup and self.max_scored < q.shape[1]:
             standing = jax.vmap(jax.vmap(functools.partial(features.standing_points, self.robot)))
             blocked = jnp.min(jax.vmap(read)(sight.image, standing(q, points)), axis=-1) <= 0
             rank = jnp.where(possible, jnp.where(blocked, 1.0, 2.0), 0.0)
-            _, kept = jax.lax.top_k(rank, self.judged)
+            _, kept = jax.lax.top_k(rank, self.max_scored)
             q, points, possible = jax.vmap(
                 lambda kept, arrays: jax.tree.map(lambda x: x[kept], arrays)
             )(kept, (q, points, possible))
@@ -93,7 +93,7 @@ class Discriminator:
         many = min(self.checked, q.shape[1])
         _, best = jax.lax.top_k(jnp.where(possible, logits, -jnp.inf), many)
         chosen = jnp.take_along_axis(q, best[..., None], axis=1)
-        chosen = into_limits(world, features.to_world(chosen, sight.centre[:, None]))
+        chosen = enforce_bounds(world, features.to_world(chosen, sight.center[:, None]))
         return _first_free(world, q_from, chosen, self.edge_checks)
 
     def _candidates(
@@ -134,7 +134,7 @@ class Generator:
             self.variables, sight.image, sight.start, sight.goal, z, method=CVAE.decode
         )
         q = features.to_configuration(self.config, self.robot, made)
-        q = into_limits(world, features.to_world(q, sight.centre[:, None]))
+        q = enforce_bounds(world, features.to_world(q, sight.center[:, None]))
         return _first_free(world, q_from, q, self.edge_checks)
 
 
@@ -143,7 +143,7 @@ class _Sight:
     """What the networks are told about B starts and goals."""
 
     image: jax.Array  # (B, X, Y, Z)
-    centre: jax.Array  # (B, 2) of the local frames [m]
+    center: jax.Array  # (B, 2) of the local frames [m]
     start: jax.Array  # (B, E)
     goal: jax.Array  # (B, E')
     ends: jax.Array  # (B, 2, D) local
@@ -156,13 +156,13 @@ def _look(
     padded = surrounding_map(config, world.field)
     resolution = world.field.resolution
     origin = world.field.origin[:2] + resolution  # the field has a rim of one cell
-    image, centre = jax.vmap(lambda q: view(config, padded, q, resolution, origin))(q_from)
+    image, center = jax.vmap(lambda q: view(config, padded, q, resolution, origin))(q_from)
     ends = jnp.stack([q_from, q_goal], axis=1)
-    ends = features.to_local(ends, centre[:, None])
+    ends = features.to_local(ends, center[:, None])
     points = jax.vmap(batch_link_features, (None, 0))(robot, ends)
     return _Sight(
         image=image,
-        centre=centre,
+        center=center,
         start=describe(config, robot, ends[:, :1], points[:, :1])[:, 0],
         goal=jax.vmap(lambda q, p: features.goal_features(config, robot, q, p))(
             ends[:, 1], points[:, 1]
@@ -186,7 +186,7 @@ def _postures(
     scale = SPREAD * jax.random.uniform(key_scale, (*q.shape[:2], 1)) ** 2
     base = jnp.arange(q.shape[-1]) < robot.base_dim
     q = jnp.where(base, jnp.pi * noise, q + scale * noise)
-    return into_limits(world, q.at[..., :2].set(0.0)).at[..., :2].set(0.0)
+    return enforce_bounds(world, q.at[..., :2].set(0.0)).at[..., :2].set(0.0)
 
 
 def _first_free(world: GridWorld, q_from: jax.Array, q: jax.Array, num_checks: int) -> jax.Array:

@@ -45,13 +45,13 @@ def draw_map(axes, grid: Grid) -> None:
     """
     low = grid.flatten(z_high=0.4).occupied[:, :, 0]
     seen = grid.occupied.any(axis=2)
-    shade = np.ones((*seen.shape, 3))
-    shade[seen] = _rgb(_COLOURS["above"])
-    shade[low & seen] = _rgb(_COLOURS["map"])
+    view_color_gradient = np.ones((*seen.shape, 3))
+    view_color_gradient[seen] = _rgb(_COLOURS["above"])
+    view_color_gradient[low & seen] = _rgb(_COLOURS["map"])
     left, bottom = grid.origin[:2]
     right, top = np.array(grid.origin[:2]) + grid.size[:2]
     axes.imshow(
-        np.swapaxes(shade, 0, 1),
+        np.swapaxes(view_color_gradient, 0, 1),
         origin="lower",
         extent=(left, right, bottom, top),
         interpolation="nearest",
@@ -59,14 +59,14 @@ def draw_map(axes, grid: Grid) -> None:
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
 
 
-def draw_robot(axes, robot: MobileRobot, q: np.ndarray, colour: str, alpha: float = 0.8) -> None:
+def draw_robot(axes, robot: MobileRobot, q: np.ndarray, color: str, alpha: float = 0.8) -> None:
     """Draw the robot at ``q`` (D,) from above."""
     from matplotlib.patches import Polygon
 
     for polygon in outlines(robot, q):
         axes.add_patch(
             Polygon(
-                polygon, facecolor=colour, edgecolor="black", linewidth=0.3, alpha=alpha, zorder=3
+                polygon, facecolor=color, edgecolor="black", linewidth=0.3, alpha=alpha, zorder=3
             )
         )
 
@@ -158,5 +158,5 @@ def _outer_points(kind: mujoco.mjtGeom, size: np.ndarray) -> np.ndarray:
     return np.concatenate([ring + half, ring - half])
 
 
-def _rgb(colour: str) -> tuple[float, ...]:
-    return tuple(int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
+def _rgb(color: str) -> tuple[float, ...]:
+    return tuple(int(color[i : i + 2], 16) / 255 for i in (1, 3, 5))

@@ -40,7 +40,7 @@ def test_only_one_file_touches_mjx():
         if any(m == "mujoco.mjx" or m.startswith("mujoco.mjx.") for m in imports(file))
         or "from mujoco import mjx" in file.read_text()
     ]
-    assert sorted(users) == ["bench/kinematics.py", "core/mjx_backend.py"]
+    assert sorted(users) == ["bench/kinematics.py", "scene/mjx.py"]
 
 
 def test_files_are_short():

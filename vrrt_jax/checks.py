@@ -90,16 +90,20 @@ def check_limits(robot: Robot, q: Any, what: str) -> np.ndarray:
             f"the {what} has shape {q.shape}; expected ({len(names)},) for the joints "
             f"{', '.join(names)}"
         )
-    for name, value, low, high, wraps in zip(
-        names, q, robot.lower, robot.upper, robot.wraps, strict=True
+    for name, value, low, high, is_continuous in zip(
+        names, q, robot.lower, robot.upper, robot.is_continuous, strict=True
     ):
-        if not np.isfinite(value) or (not wraps and not low - 1e-5 <= value <= high + 1e-5):
+        if not np.isfinite(value) or (not is_continuous and not low - 1e-5 <= value <= high + 1e-5):
             raise ValueError(
                 f"the {what} is outside the limits: joint '{name}' is at {value:.4f}, its bounds "
                 f"are [{low:.4f}, {high:.4f}]"
             )
-    turns = np.where(robot.wraps & (np.abs(q) > np.pi), np.floor((q + np.pi) / (2 * np.pi)), 0.0)
-    inside = np.where(robot.wraps, q - 2 * np.pi * turns, np.clip(q, robot.lower, robot.upper))
+    turns = np.where(
+        robot.is_continuous & (np.abs(q) > np.pi), np.floor((q + np.pi) / (2 * np.pi)), 0.0
+    )
+    inside = np.where(
+        robot.is_continuous, q - 2 * np.pi * turns, np.clip(q, robot.lower, robot.upper)
+    )
     return inside.astype(np.float32)
 
 

@@ -259,7 +259,7 @@ def _fit(arguments: argparse.Namespace) -> int:
         print(
             f"{level.splats.num_splats} splats at {level.size_px} px: {level.psnr_db:.1f} dB on "
             f"{model.info['num_validation']} unseen poses and cameras, match bar "
-            f"{level.match_bar:.3g} of the covered share"
+            f"{level.match_threshold:.3g} of the covered share"
         )
     print(f"wrote {arguments.out} after {model.info['seconds']:.0f} s, seed {model.seed}")
     return EXIT_SOLVED
@@ -277,7 +277,8 @@ def _spheres(arguments: argparse.Namespace) -> int:
         print(f"wrote {arguments.out}")
         robot = load_robot(arguments.out)
     measured = measure_spheres(robot, num=arguments.num, seed=arguments.seed)
-    print(f"{len(robot.cover.radius)} covering and {len(robot.thin.radius)} thin spheres")
+    covering, thin = robot.collision_spheres.radius, robot.self_collision_spheres.radius
+    print(f"{len(covering)} covering and {len(thin)} thin spheres")
     for name, counts in (
         ("against obstacles", measured.obstacles),
         ("against itself", measured.self_collision),

@@ -13,7 +13,7 @@ from vrrt_jax.config import PlannerConfig, PlanResult
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.planners.rrt import RRT, tree_path
 from vrrt_jax.core.planners.rrt_connect import RRTConnect, connection_path
-from vrrt_jax.core.search import interruptible, make_stop, search
+from vrrt_jax.core.search import interruptible, make_termination, search
 from vrrt_jax.core.types import Status, Tree
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.world import World
@@ -28,7 +28,7 @@ from vrrt_jax.visual.finish import (
     timed,
     with_time_of,
 )
-from vrrt_jax.visual.goal import Setup, Sight, visual_setup, visual_stop
+from vrrt_jax.visual.goal import Setup, Sight, visual_setup, visual_termination
 from vrrt_jax.visual.policy import best_probes, forest, plant
 
 PLANTING = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
@@ -111,7 +111,7 @@ def _attempt(
         setup.policy,
         tree,
         key=key,
-        stop=visual_stop(config, setup.goal_loss),
+        stop=visual_termination(config, setup.goal_loss),
         time_limit_s=time_left(config, plant_s).time_limit_s,
         on_progress=on_progress,
     )
@@ -192,7 +192,7 @@ def plan_batch(
             _stack([setup.policy for setup in setups]),
             _stack(forests),
             key=keys,
-            stop=_stack([visual_stop(config, setup.goal_loss) for setup in setups]),
+            stop=_stack([visual_termination(config, setup.goal_loss) for setup in setups]),
             time_limit_s=time_left(config, sum(plant_s)).time_limit_s,
             batched=True,
             on_progress=on_progress,
@@ -261,7 +261,7 @@ def plan_to_configuration(
         stop_score = -1.0 if policy.star else 1e-4
     else:
         raise ValueError(f"unknown planner '{planner}'; have: rrt, rrt-star, rrt-connect")
-    stop = make_stop(stop_score, max_iterations=config.max_iterations)
+    stop = make_termination(stop_score, max_iterations=config.max_iterations)
     found = search(
         world,
         policy,

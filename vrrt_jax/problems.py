@@ -132,7 +132,7 @@ def camera_from_dict(fields: Mapping[str, Any], size: tuple[int, ...]) -> Camera
             return camera_from_matrix(
                 np.array(fields["world_to_cam"], np.float64),
                 focal=float(fields["focal"]),
-                centre=fields.get("centre"),
+                principal_point=fields.get("centre"),
                 height=height,
                 width=width,
             )

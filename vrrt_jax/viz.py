@@ -66,24 +66,26 @@ def _mesh_renderer(robot: Robot, world: World) -> Any:
 
 
 def _splat_layers(splats: SplatModel, robot: Robot, camera: Camera, q: jax.Array):
-    """Colour over black, coverage and depth of the robot."""
+    """Color over black, coverage and depth of the robot."""
     poses = link_poses(robot.chain, q)
     rgb, coverage = render(splats, poses, camera)
     pose = poses[splats.link]
     points = jnp.einsum("gij,gj->gi", pose[:, :3, :3], splats.mean) + pose[:, :3, 3]
     _, depth = project(camera, points)
     as_colour = dataclasses.replace(
-        splats, rgb=jnp.repeat(depth[:, None], 3, axis=1), shade=jnp.zeros_like(splats.shade)
+        splats,
+        rgb=jnp.repeat(depth[:, None], 3, axis=1),
+        view_color_gradient=jnp.zeros_like(splats.view_color_gradient),
     )
     weighted, _ = render(as_colour, poses, camera)
     return rgb, coverage, weighted[..., 0] / jnp.maximum(coverage, 1e-3)
 
 
 def _draw_obstacles(world: World, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Sphere-trace the obstacles: colour (H, W, 3) and depth (H, W), +inf where there is none."""
+    """Sphere-trace the obstacles: color (H, W, 3) and depth (H, W), +inf where there is none."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    centre, focal = np.asarray(camera.centre), float(camera.focal)
-    in_cam = np.stack([(x - centre[0]) / focal, (y - centre[1]) / focal, np.ones_like(x)], -1)
+    center, focal = np.asarray(camera.principal_point), float(camera.focal)
+    in_cam = np.stack([(x - center[0]) / focal, (y - center[1]) / focal, np.ones_like(x)], -1)
     rotation = np.asarray(camera.world_to_cam[:3, :3])
     eye = jnp.asarray(-rotation.T @ np.asarray(camera.world_to_cam[:3, 3]))
     rays = jnp.asarray((in_cam.reshape(-1, 3) @ rotation).T, jnp.float32)  # depth 1 along the axis
@@ -107,11 +109,11 @@ def _draw_obstacles(world: World, camera: Camera) -> tuple[np.ndarray, np.ndarra
         return depth, hit, jnp.argmin(surface, axis=1), facing
 
     depth, hit, which, facing = (np.asarray(a) for a in trace(rays, stretch))
-    palette = np.array([list(c[:3]) if c else [0.5, 0.5, 0.5] for c in world.colours])
-    colour = palette[which] * (0.45 + 0.55 * facing[:, None])
-    colour = np.where(hit[:, None], colour, SKY)
+    palette = np.array([list(c[:3]) if c else [0.5, 0.5, 0.5] for c in world.colors])
+    color = palette[which] * (0.45 + 0.55 * facing[:, None])
+    color = np.where(hit[:, None], color, SKY)
     shape = (camera.height, camera.width)
-    return colour.reshape(*shape, 3), np.where(hit, depth, np.inf).reshape(shape)
+    return color.reshape(*shape, 3), np.where(hit, depth, np.inf).reshape(shape)
 
 
 def along(world: World, path: np.ndarray, num: int) -> np.ndarray:
@@ -158,7 +160,7 @@ def save_animation(
 
 
 def _picture(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A goal image over the sky's colour, resized: (H, W, 3) uint8."""
+    """A goal image over the sky's color, resized: (H, W, 3) uint8."""
     image = np.asarray(image, np.float32)
     if image.shape[2] == 4:
         image = image[..., :3] * image[..., 3:] + SKY * (1 - image[..., 3:])

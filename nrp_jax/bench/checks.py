@@ -36,10 +36,10 @@ class SphereLoop:
             self.grid.occupied, [(rim, rim), (rim, rim), (0, 0)], constant_values=True
         )
         self.corner = np.array(self.grid.origin) - rim * self.grid.resolution * np.array([1, 1, 0])
-        self.link = np.asarray(robot.cover.link)
-        self.centre = np.asarray(robot.cover.centre, float)
-        self.radius = np.asarray(robot.cover.radius, float)
-        self.pairs = np.asarray(robot.pairs)
+        self.link = np.asarray(robot.collision_spheres.link)
+        self.center = np.asarray(robot.collision_spheres.center, float)
+        self.radius = np.asarray(robot.collision_spheres.radius, float)
+        self.pairs = np.asarray(robot.self_collision_pairs)
         self.chain = [
             np.asarray(getattr(robot.chain, name), float)
             for name in ("constant", "cosine", "sine", "slide")
@@ -50,19 +50,19 @@ class SphereLoop:
         """Whether ``q`` (D,) is free."""
         pose = self.poses(q)
         turned = pose[self.link]
-        centre = np.einsum("nij,nj->ni", turned[:, :3, :3], self.centre) + turned[:, :3, 3]
+        center = np.einsum("nij,nj->ni", turned[:, :3, :3], self.center) + turned[:, :3, 3]
         first, second = self.pairs.T
-        apart = np.linalg.norm(centre[first] - centre[second], axis=1)
+        apart = np.linalg.norm(center[first] - center[second], axis=1)
         if (apart < self.radius[first] + self.radius[second]).any():
             return False
         if robot_plates_overlap(self.robot, pose):
             return False
-        if (centre[self.falls, 2] <= self.radius[self.falls]).any():
+        if (center[self.falls, 2] <= self.radius[self.falls]).any():
             return False
-        if any(self._hits(c, r) for c, r in zip(centre, self.radius, strict=True)):
+        if any(self._hits(c, r) for c, r in zip(center, self.radius, strict=True)):
             return False
         base = self.robot.footprint
-        return base is None or self._base_is_free(pose[base.link, :3, 3], centre)
+        return base is None or self._base_is_free(pose[base.link, :3, 3], center)
 
     def poses(self, q: np.ndarray) -> np.ndarray:
         """Link poses (L, 4, 4)."""
@@ -75,11 +75,11 @@ class SphereLoop:
             poses.append(poses[parent] @ local)
         return np.array(poses)
 
-    def _hits(self, centre: np.ndarray, radius: float, top: float | None = None) -> bool:
+    def _hits(self, center: np.ndarray, radius: float, top: float | None = None) -> bool:
         """Whether a sphere, or an upright cylinder up to ``top``, touches a solid cell."""
         flat = self.robot.planar or top is not None
         size, reach = self.grid.resolution, np.full(3, radius)
-        place = (centre - self.corner) / size
+        place = (center - self.corner) / size
         low = np.floor(place - reach / size).astype(int)
         high = np.floor(place + reach / size).astype(int) + 1
         if top is not None:
@@ -93,12 +93,12 @@ class SphereLoop:
         gap = np.maximum(np.maximum(cells - place, place - cells - 1), 0) * size
         return bool(((gap[:, : 2 if flat else 3] ** 2).sum(1) < radius**2).any())
 
-    def _base_is_free(self, position: np.ndarray, centre: np.ndarray) -> bool:
+    def _base_is_free(self, position: np.ndarray, center: np.ndarray) -> bool:
         base = self.robot.footprint
         assert base is not None
         radius, height = float(base.radius), float(base.height)
-        beside = np.linalg.norm(centre[:, :2] - position[:2], axis=1) - radius
-        gap = np.hypot(np.maximum(beside, 0), np.maximum(centre[:, 2] - height, 0))
+        beside = np.linalg.norm(center[:, :2] - position[:2], axis=1) - radius
+        gap = np.hypot(np.maximum(beside, 0), np.maximum(center[:, 2] - height, 0))
         if (gap[self.falls] < self.radius[self.falls]).any():
             return False
         return not self._hits(position, radius, top=height)
@@ -109,12 +109,12 @@ def robot_plates_overlap(robot: MobileRobot, poses: np.ndarray) -> bool:
     if robot.plates is None:
         return False
     corners = []
-    for link, centre, half in zip(
+    for link, center, half in zip(
         robot.plates.link,
-        *(np.asarray(a) for a in (robot.plates.centre, robot.plates.half)),
+        *(np.asarray(a) for a in (robot.plates.center, robot.plates.half)),
         strict=True,
     ):
-        local = centre + half * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
+        local = center + half * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
         corners.append(local @ poses[link, :2, :2].T + poses[link, :2, 3])
     for i, j in robot.plates.pairs:
         both = (corners[i], corners[j])

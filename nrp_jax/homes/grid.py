@@ -10,7 +10,7 @@ from PIL import Image, UnidentifiedImageError
 
 RESOLUTION = 0.1  # [m]
 HEIGHT = 2.0  # of a home [m]
-_UNKNOWN = 0.196  # just below the occupancy of ROS's grey 205, which stands for unknown
+_UNKNOWN = 0.196  # just below the occupancy of ROS's gray 205, which stands for unknown
 _PROBE = "cell"
 
 
@@ -45,10 +45,10 @@ class Grid:
                     "True where a cell is solid: apply a threshold first"
                 )
         if not (np.isfinite(resolution) and resolution > 0):
-            raise ValueError(f"the map's resolution is {resolution}; expected metres, such as 0.1")
+            raise ValueError(f"the map's resolution is {resolution}; expected meters, such as 0.1")
         origin = tuple(float(v) for v in self.origin)
         if len(origin) not in (2, 3) or not np.isfinite(origin).all():
-            raise ValueError(f"the map's origin is {origin}; expected x, y and perhaps z in metres")
+            raise ValueError(f"the map's origin is {origin}; expected x, y and perhaps z in meters")
         if occupied.ndim == 2:
             occupied = occupied[:, :, None]
         object.__setattr__(self, "occupied", occupied.astype(bool, copy=False))
@@ -182,14 +182,14 @@ def _read_npz(path: Path) -> Grid:
 
 
 def _read_ros(path: Path) -> Grid:
-    """A planar map of ROS's map_server: grey values, the top row at the largest y."""
+    """A planar map of ROS's map_server: gray values, the top row at the largest y."""
     try:
         about = yaml.safe_load(path.read_text())
         resolution, origin = float(about["resolution"]), [float(v) for v in about["origin"]]
         occupied_from = float(about.get("occupied_thresh", 0.65))
         free_below = min(float(about.get("free_thresh", _UNKNOWN)), _UNKNOWN)
         image = Image.open(path.parent / about["image"])
-        grey = np.asarray(image.convert("L"), float) / 255
+        gray = np.asarray(image.convert("L"), float) / 255
     except (KeyError, TypeError, ValueError, yaml.YAMLError, UnidentifiedImageError) as error:
         raise ValueError(
             f"it is not a map_server file with image, resolution and origin: {error!r}"
@@ -204,9 +204,9 @@ def _read_ros(path: Path) -> Grid:
             f"its image has pixels of kind '{image.mode}'; expected 8 bits a pixel: convert it"
         )
     if not about.get("negate", 0):
-        grey = 1 - grey
+        gray = 1 - gray
     clear = np.asarray(image.convert("RGBA").getchannel("A")) < 255
-    solid = ~(grey < free_below) | (grey > occupied_from) | clear  # unknown is solid
+    solid = ~(gray < free_below) | (gray > occupied_from) | clear  # unknown is solid
     return Grid(occupied=solid[::-1].T, resolution=resolution, origin=(origin[0], origin[1], 0.0))
 
 
@@ -253,6 +253,6 @@ def _read_mjcf(path: Path) -> Grid:
 def _bounds(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[np.ndarray, np.ndarray]:
     """Corners (3,) and (3,) of a geom's bounding box in the world [m]."""
     rotation = data.geom_xmat[geom].reshape(3, 3)
-    centre = data.geom_xpos[geom] + rotation @ model.geom_aabb[geom, :3]
+    center = data.geom_xpos[geom] + rotation @ model.geom_aabb[geom, :3]
     reach = np.abs(rotation) @ model.geom_aabb[geom, 3:]
-    return centre - reach, centre + reach
+    return center - reach, center + reach

@@ -72,9 +72,9 @@ def is_connected(grid: Grid, kind: str) -> bool:
 
 
 def floor(grid: Grid, kind: str) -> np.ndarray:
-    """Cells (X, Y) whose centres have 0.3 m of air around them at the heights of a robot's body."""
+    """Cells (X, Y) whose centers have 0.3 m of air around them at the heights of a robot's body."""
     plan = grid.flatten(0.0, BODY[kind]).occupied[:, :, 0]
-    # Distances run between centres of cells: half a cell of each belongs to the obstacle.
+    # Distances run between centers of cells: half a cell of each belongs to the obstacle.
     return _distance(~plan) * grid.resolution > ERODE + 0.5 * grid.resolution
 
 
@@ -137,7 +137,7 @@ class _Draft:
         self.body = body
         i, j = np.ogrid[-SPREAD : SPREAD + 1, -SPREAD : SPREAD + 1]
         self.disc = i**2 + j**2 < (SPREAD + 0.5) ** 2
-        # Where the centre of the base cannot be; a little less near walls, so that doors pass.
+        # Where the center of the base cannot be; a little less near walls, so that doors pass.
         self.blocked = _distance(~self.walls) <= SPREAD - 0.5
 
     def keep_clear(self, door: Room, reach: int = 6) -> None:
@@ -211,7 +211,7 @@ def _scan(rng: np.random.Generator, draft: _Draft, kind: str) -> np.ndarray:
     occupied = draft.occupied.copy()
     plan = draft.walls.shape
     beside = ndimage.binary_dilation(occupied, np.ones((3, 3, 1), bool)) & ~occupied
-    # Rags hang together over half a metre of height.
+    # Rags hang together over half a meter of height.
     ragged = np.repeat(rng.random((*plan, 4)) < 0.13, HEIGHT // 4, axis=2)
     blobs = ndimage.binary_dilation(rng.random(plan) < 0.002, iterations=2)
     near_wall = cast(np.ndarray, ndimage.binary_dilation(draft.walls, iterations=2))

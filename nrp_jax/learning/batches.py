@@ -17,7 +17,7 @@ from nrp_jax.learning import features, local_map
 from nrp_jax.learning.data import Dataset
 from nrp_jax.learning.expert import POSITIVE
 from nrp_jax.learning.models import ModelConfig
-from nrp_jax.scene.field import Field, make_field
+from nrp_jax.scene.field import DistanceField, make_field
 from nrp_jax.scene.robots import MobileRobot, batch_link_features
 from vrrt_jax.core.types import pytree
 
@@ -47,7 +47,7 @@ class Batch:
     weight: jax.Array  # (n, W)
 
 
-def surrounding_map(config: ModelConfig, field: Field) -> jax.Array:
+def surrounding_map(config: ModelConfig, field: DistanceField) -> jax.Array:
     """A field's map as the images are cut from it: (X + 40, Y + 40, Z), bordered by solid cells.
 
     Distances to obstacles [m]; for the published models occupancies.
@@ -76,7 +76,7 @@ def view(
     """
     if config.scope == "window":
         image = local_map.window(padded, q, resolution, origin)
-        return image, local_map.centre(q, resolution, origin)
+        return image, local_map.center(q, resolution, origin)
     side, half = CELLS[config.task], local_map.SIDE // 2
     size = np.array(padded.shape[:2]) - 2 * half
     excess = np.maximum(side - size, 0)  # maps may be smaller, or larger and then are cut
@@ -224,13 +224,13 @@ def _local(config: ModelConfig, examples: Examples, index: jax.Array):
     home, q, points = examples.home[index], examples.q[index], examples.points[index]
     if config.scope == "window":
         image = local_map.stacked_window(examples.maps, home, q[0])
-        centre = local_map.centre(q[0])
+        center = local_map.center(q[0])
     else:
-        image, centre = view(
+        image, center = view(
             config, examples.maps[home], q[0], jnp.float32(RESOLUTION), jnp.zeros(2)
         )
-    points = points - jnp.append(centre, 0.0)
-    return image.astype(jnp.float32), features.to_local(q, centre), points
+    points = points - jnp.append(center, 0.0)
+    return image.astype(jnp.float32), features.to_local(q, center), points
 
 
 def relations(robot: MobileRobot, image: jax.Array, q: jax.Array, points: jax.Array) -> jax.Array:

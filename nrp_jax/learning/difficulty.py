@@ -92,7 +92,7 @@ def long_queries(
 
 
 def _floor_graph(index: np.ndarray, resolution: float) -> sparse.csr_matrix:
-    """Steps to the eight neighbours between cells numbered by ``index`` (X, Y), -1 elsewhere."""
+    """Steps to the eight neighbors between cells numbered by ``index`` (X, Y), -1 elsewhere."""
     edges = []
     for i, j in ((1, 0), (0, 1), (1, 1), (1, -1)):
         a, b = index[: len(index) - i], index[i:]
@@ -126,7 +126,7 @@ def rrt_is(world: GridWorld, q_start: jax.Array, q_goal: jax.Array, key: jax.Arr
         edge = world.edge(nearest, target)
         num = jnp.minimum(world.parts(edge, _SUB_STEPS), _SUB_STEPS)
         points = jax.vmap(
-            lambda f: world.normalise(world.end(nearest, world.part(edge, f)))
+            lambda f: world.normalize(world.end(nearest, world.truncate(edge, f)))
         )(step / num)  # fmt: skip
         free = jax.vmap(world.is_free)(points) & (step <= num)
         passed = jnp.sum(jnp.cumprod(free))

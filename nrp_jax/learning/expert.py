@@ -21,7 +21,7 @@ from nrp_jax.scene.robots import MobileRobot, batch_link_features
 from nrp_jax.scene.world import GridWorld, batch_is_free
 from vrrt_jax.core.planners.rrt import sample_configurations
 
-HALF_WINDOW = 1.95  # [m] what is surely inside a window, whose centre is rounded to cells
+HALF_WINDOW = 1.95  # [m] what is surely inside a window, whose center is rounded to cells
 BODY_RADIUS = {"snake": 0.11, "fetch": 0.3}  # of the base [m]
 POSITIVE = 1.1  # path through a waypoint over the optimum, up to which the waypoint is good
 CANDIDATES = 200  # pairs checked for a node, on average
@@ -248,7 +248,7 @@ def _survivors(
 @jax.jit
 def _chunk_free(world: GridWorld, q_from, edge, index: jax.Array, fraction: jax.Array):
     edge = jax.tree.map(lambda leaf: leaf[index], edge)
-    q = world.end(q_from[index], world.part(edge, fraction))
+    q = world.end(q_from[index], world.truncate(edge, fraction))
     # Without the barrier the points are computed once for every use of a joint.
     return jax.vmap(world.is_free)(jax.lax.optimization_barrier(q))
 

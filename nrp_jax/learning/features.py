@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax.learning.models import ModelConfig
-from nrp_jax.scene.field import Field
+from nrp_jax.scene.field import DistanceField
 from nrp_jax.scene.robots import MobileRobot
 from vrrt_jax.core.edges import short_way
 
@@ -19,14 +19,14 @@ WAY = 4  # places along an edge at which the surroundings are read
 HEADING = 2  # the joint that turns the whole robot, for both robots
 
 
-def to_local(q: jax.Array, centre: jax.Array) -> jax.Array:
+def to_local(q: jax.Array, center: jax.Array) -> jax.Array:
     """Configurations (..., D) in the frame at a place (..., 2) of the map [m]; no rotation."""
-    return jnp.concatenate([q[..., :2] - centre, q[..., 2:]], axis=-1)
+    return jnp.concatenate([q[..., :2] - center, q[..., 2:]], axis=-1)
 
 
-def to_world(q: jax.Array, centre: jax.Array) -> jax.Array:
+def to_world(q: jax.Array, center: jax.Array) -> jax.Array:
     """The inverse of :func:`to_local`."""
-    return jnp.concatenate([q[..., :2] + centre, q[..., 2:]], axis=-1)
+    return jnp.concatenate([q[..., :2] + center, q[..., 2:]], axis=-1)
 
 
 def configuration_features(
@@ -111,12 +111,12 @@ def cells(points: jax.Array, shape: tuple[int, ...], resolution: float) -> jax.A
 
 def steps(robot: MobileRobot, q: jax.Array, end: jax.Array) -> jax.Array:
     """How far base and arm are apart (..., 2) in configurations (..., D) and (D,) [m] and [rad]."""
-    squared = short_way(q - end, robot.wraps) ** 2
+    squared = short_way(q - end, robot.is_continuous) ** 2
     base, arm = squared[..., :2].sum(-1), squared[..., robot.base_dim :].sum(-1)
     return jnp.sqrt(jnp.stack([base, arm], axis=-1) + 1e-12)
 
 
-def surroundings(field: Field) -> jax.Array:
+def surroundings(field: DistanceField) -> jax.Array:
     """The map (X, Y, Z) behind a field: distances to obstacles at each cell's middle [m].
 
     Distances beyond ``CLEAR`` count as that; solid cells hold 0.

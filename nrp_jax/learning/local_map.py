@@ -1,6 +1,6 @@
 """Local windows: what the networks see of a map around the base of the robot.
 
-A window is 4 x 4 m (x 2 m), aligned with the map, centred on the corner of cells nearest to the
+A window is 4 x 4 m (x 2 m), aligned with the map, centered on the corner of cells nearest to the
 base: cell (i, j) of it covers [0.1 (i - 20), 0.1 (i - 19)) from there. Outside the map everything
 is occupied.
 """
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 SIDE = 40  # cells
 
 
-def centre_cell(
+def center_cell(
     q: jax.Array, resolution: jax.Array | float = 0.1, origin: Any = (0.0, 0.0)
 ) -> jax.Array:
     """Corner of cells (..., 2) i32 nearest to the base at ``q`` (..., D), from the map's origin."""
@@ -21,11 +21,11 @@ def centre_cell(
     return jnp.round(place / resolution).astype(jnp.int32)
 
 
-def centre(
+def center(
     q: jax.Array, resolution: jax.Array | float = 0.1, origin: Any = (0.0, 0.0)
 ) -> jax.Array:
-    """Place (..., 2) [m] of the window's centre in the map: the origin of the local frame."""
-    cell = centre_cell(q, resolution, origin)
+    """Place (..., 2) [m] of the window's center in the map: the origin of the local frame."""
+    cell = center_cell(q, resolution, origin)
     return cell * resolution + jnp.asarray(origin, q.dtype)[..., :2]
 
 
@@ -40,7 +40,7 @@ def window(
         resolution: side of a cell [m].
         origin: place of the corner of the map's first cell [m].
     """
-    corner = centre_cell(q, resolution, origin)  # the border shifts it by half a window, and back
+    corner = center_cell(q, resolution, origin)  # the border shifts it by half a window, and back
     size = (SIDE, SIDE, padded.shape[2])
     return jax.lax.dynamic_slice(padded, (corner[0], corner[1], 0), size)
 
@@ -49,6 +49,6 @@ def stacked_window(
     padded: jax.Array, index: jax.Array, q: jax.Array, resolution: jax.Array | float = 0.1
 ) -> jax.Array:
     """The window (40, 40, Z) around ``q`` in map ``index`` of several (H, X + 40, Y + 40, Z)."""
-    corner = centre_cell(q, resolution)
+    corner = center_cell(q, resolution)
     size = (1, SIDE, SIDE, padded.shape[3])
     return jax.lax.dynamic_slice(padded, (index, corner[0], corner[1], 0), size)[0]

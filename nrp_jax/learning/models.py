@@ -65,7 +65,7 @@ def check_choices(task: str, kind: str, scope: str = "window") -> None:
             raise ValueError(f"unknown {name} '{value}'; have: {', '.join(choices)}")
 
 
-# Features, kernel, stride, padding, normalised, pooled: the convolutions of the published models.
+# Features, kernel, stride, padding, normalized, pooled: the convolutions of the published models.
 _SNAKE = (
     (16, (4, 4), 2, 1, False, False),
     (32, (3, 3), 2, 1, True, False),
@@ -118,9 +118,9 @@ class PaperEncoder(nn.Module):
         key = (config.task, config.scope)
         layers = _CONVOLUTIONS.get(key) or _CONVOLUTIONS[(*key, config.kind)]
         x = image if config.task == "snake" else _with_coordinates(image)
-        for features, kernel, stride, padding, normalised, pooled in layers:
+        for features, kernel, stride, padding, normalized, pooled in layers:
             x = nn.Conv(features, kernel, stride, padding)(x)
-            if normalised:
+            if normalized:
                 x = nn.BatchNorm(use_running_average=not train, epsilon=1e-4, momentum=0.9)(x)
             x = nn.leaky_relu(x, 0.1 if config.task == "fetch" else 0.01)
             if pooled:
@@ -132,13 +132,13 @@ class PaperEncoder(nn.Module):
 
 
 def _with_coordinates(image: jax.Array) -> jax.Array:
-    """Occupancy and the centres of its cells [m], as four channels (n, X, Y, Z, 4)."""
+    """Occupancy and the centers of its cells [m], as four channels (n, X, Y, Z, 4)."""
     size = jnp.array(image.shape[1:])
     cells = jnp.stack(jnp.meshgrid(*map(jnp.arange, image.shape[1:]), indexing="ij"), axis=-1)
     middle = jnp.array([0.5, 0.5, 0.0]) * size  # heights count from the floor
-    centres = 0.1 * (cells + 0.5 - middle)
-    centres = jnp.broadcast_to(centres, (len(image), *centres.shape))
-    return jnp.concatenate([image[..., None], centres.astype(image.dtype)], axis=-1)
+    centers = 0.1 * (cells + 0.5 - middle)
+    centers = jnp.broadcast_to(centers, (len(image), *centers.shape))
+    return jnp.concatenate([image[..., None], centers.astype(image.dtype)], axis=-1)
 
 
 def _normalised(x: jax.Array, train: bool, slope: float = 0.01) -> jax.Array:
@@ -174,7 +174,7 @@ class Discriminator(nn.Module):
             candidates: (n, C, E'') features, or (1, C, E'') if all starts share them.
             relation: (n, C, R) to the surroundings and the ends, in numbers; unused
                 without ``lookup``.
-            train: normalise by this batch.
+            train: normalize by this batch.
         """
         config = self.config
         context = jnp.concatenate([_encoder(config)(image, train), start, goal], axis=-1)

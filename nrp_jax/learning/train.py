@@ -21,7 +21,14 @@ from nrp_jax.learning.batches import Batch, Examples, load_examples, make_batch
 from nrp_jax.learning.checkpoint import Model, build_module, save_model
 from nrp_jax.learning.data import fingerprint, load_dataset
 from nrp_jax.learning.models import ModelConfig
-from nrp_jax.learning.training_io import Keeper, State, claim, plot_curves, waited, write_log
+from nrp_jax.learning.training_io import (
+    CheckpointStore,
+    State,
+    claim_output_dir,
+    plot_curves,
+    waited,
+    write_log,
+)
 from nrp_jax.scene.robots import MobileRobot, load_robot
 
 
@@ -57,7 +64,7 @@ def train(
         examples: from :func:`nrp_jax.learning.batches.load_examples`.
         out: folder for ``model.npz`` (the best epoch), ``log.csv``, ``curves.png`` and
             ``checkpoint/`` (the last epoch).
-        settings: of the optimiser.
+        settings: of the optimizer.
         stamp: names the data; a training goes on only with the same.
         progress: show a bar.
 
@@ -71,7 +78,7 @@ def train(
     """
     parts = {"model": dataclasses.asdict(config), "settings": dataclasses.asdict(settings)}
     training, validation = split_by_home(np.asarray(examples.home), settings)
-    out = claim(Path(out), {**parts, "data": stamp})
+    out = claim_output_dir(Path(out), {**parts, "data": stamp})
     sample = make_batch(config, robot, examples, jnp.zeros(1, jnp.int32))
     module = build_module(config, sample.waypoints.shape[-1])
     size = min(settings.batch, len(training))
@@ -79,14 +86,14 @@ def train(
     schedule = optax.warmup_cosine_decay_schedule(
         0.0, settings.learning_rate, min(200, steps // 10 + 1), steps + 1
     )
-    optimiser = optax.adamw(schedule, weight_decay=settings.weight_decay)
+    optimizer = optax.adamw(schedule, weight_decay=settings.weight_decay)
     variables = init(config, module, sample, jax.random.key(settings.seed))
     state = State(
         variables=variables,
-        optimiser=optimiser.init(variables["params"]),
+        optimizer=optimizer.init(variables["params"]),
         step=jnp.int32(0),
     )
-    keeper = Keeper(out / "checkpoint")
+    keeper = CheckpointStore(out / "checkpoint")
     state, best, history = keeper.restore(state)
 
     def export() -> Model:
@@ -110,10 +117,10 @@ def train(
         (loss, (_, changed)), gradient = jax.value_and_grad(objective, has_aux=True)(
             state.variables["params"]
         )
-        updates, moments = optimiser.update(gradient, state.optimiser, state.variables["params"])
+        updates, moments = optimizer.update(gradient, state.optimizer, state.variables["params"])
         params = optax.apply_updates(state.variables["params"], updates)
         variables = {**state.variables, **changed, "params": params}
-        return State(variables=variables, optimiser=moments, step=state.step + 1), loss
+        return State(variables=variables, optimizer=moments, step=state.step + 1), loss
 
     bar = tqdm(
         range(len(history), settings.epochs),

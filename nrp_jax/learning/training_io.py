@@ -22,11 +22,11 @@ class State:
     """What changes as training goes on."""
 
     variables: Any
-    optimiser: optax.OptState
+    optimizer: optax.OptState
     step: jax.Array  # ()
 
 
-class Keeper:
+class CheckpointStore:
     """A recent epoch on disk, by orbax: a folder appears whole or not at all."""
 
     def __init__(self, folder: Path):
@@ -74,7 +74,7 @@ def waited(history: list[dict[str, float]]) -> int:
     return len(history) - 1 - int(np.argmin([row["loss"] for row in history]))
 
 
-def claim(out: Path, parts: dict[str, Any]) -> Path:
+def claim_output_dir(out: Path, parts: dict[str, Any]) -> Path:
     """Make a folder ours, or see that it was already.
 
     Raises:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import free_along
+from vrrt_jax.core.edges import free_prefix
 from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
 
@@ -67,8 +67,8 @@ class RRT:
         num_steps = self.edge_steps
         wanted = jnp.maximum(world.span(edge) / world.resolution, 1.0)
         fraction = jnp.arange(1, num_steps, dtype=q.dtype)[:, None] / wanted  # (S - 1, B)
-        between = world.part(edge, jnp.minimum(fraction, 1.0))
-        points = world.normalise(world.end(q_from, between)).reshape(-1, q.shape[-1])
+        between = world.truncate(edge, jnp.minimum(fraction, 1.0))
+        points = world.normalize(world.end(q_from, between)).reshape(-1, q.shape[-1])
         length = world.length(between)
         tree, _ = trees.insert(
             tree,
@@ -113,14 +113,14 @@ class NeuralRRT(RRT):
         self, world: GridWorld, tree: Tree, proposals: Proposals, expansion: Expansion
     ) -> Tree:
         """Go on from the waypoints that were reached towards the aims."""
-        aim, straight = proposals.carry
+        aim, straight = proposals.aux
         tree = self.with_steps(world, tree, proposals.parent, expansion.q, expansion.accepted)
         onward = expansion.accepted & ~expansion.blocked & ~straight
         edge = world.steer(expansion.q, aim, self.edge_steps)
-        passed = free_along(world, expansion.q, edge, self.edge_steps)
-        edge = world.part(edge, passed / self.edge_steps)
-        q = world.normalise(world.end(expansion.q, edge))
-        waypoint = jnp.where(onward, expansion.slot, 0)
+        passed = free_prefix(world, expansion.q, edge, self.edge_steps)
+        edge = world.truncate(edge, passed / self.edge_steps)
+        q = world.normalize(world.end(expansion.q, edge))
+        waypoint = jnp.where(onward, expansion.node_index, 0)
         score, length = world.distance(q, self.goal), world.length(edge)
         moved = onward & (passed > 0) & jnp.isfinite(score) & (length > 1e-5)
         tree, slot = trees.insert(

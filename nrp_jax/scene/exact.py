@@ -98,13 +98,13 @@ def _motion_problem(
     """What is wrong with a trajectory (T, D) before anything is touched."""
     if not np.isfinite(trajectory).all():
         return "the path is not finite"
-    wraps = np.asarray(robot.wraps)
-    outside = ((trajectory < lower - 1e-4) | (trajectory > upper + 1e-4)) & ~wraps
+    is_continuous = np.asarray(robot.is_continuous)
+    outside = ((trajectory < lower - 1e-4) | (trajectory > upper + 1e-4)) & ~is_continuous
     if outside.any():
         joint = int(np.argwhere(outside)[0, 1])
         return f"{robot.joint_names[joint]} leaves its limits"
     step = np.diff(trajectory, axis=0)
-    step[:, wraps] = (step[:, wraps] + np.pi) % (2 * np.pi) - np.pi
+    step[:, is_continuous] = (step[:, is_continuous] + np.pi) % (2 * np.pi) - np.pi
     if (np.abs(step) > STEP * 1.01 + 1e-4).any():
         return f"the path has a gap of {np.abs(step).max():.3f}"
     if robot.base_dim == 2:  # it slides; one that turns drives like a car

@@ -17,7 +17,7 @@ FINE = {2: 8, 3: 2}  # lattice steps a cell, by the map's dimension
 
 
 @pytree
-class Field:
+class DistanceField:
     """Distances to the nearest solid cell; planar if there is one layer."""
 
     values: jax.Array  # (X', Y', Z') [m]
@@ -35,7 +35,7 @@ class Field:
         return self.step * self.fine
 
 
-def make_field(grid: Grid) -> Field:
+def make_field(grid: Grid) -> DistanceField:
     """The field of a map, with a rim of one solid cell around it in x and y.
 
     The lattice holds the corners of all cells, so the point of a cell that is nearest to a lattice
@@ -49,14 +49,14 @@ def make_field(grid: Grid) -> Field:
     step = grid.resolution / fine
     distance = ndimage.distance_transform_edt(~solid, sampling=step)
     origin = np.array(grid.origin) - grid.resolution * np.array([1, 1, 0])
-    return Field(
+    return DistanceField(
         values=jnp.asarray(distance, jnp.float32),
         origin=jnp.asarray(origin, jnp.float32),
         step=jnp.float32(step),
     )
 
 
-def room(field: Field, points: jax.Array) -> jax.Array:
+def clearance_bound(field: DistanceField, points: jax.Array) -> jax.Array:
     """A lower bound (n,) of the distance from points (3, n) to the nearest solid cell [m]."""
     shape = field.values.shape
     place = (points - field.origin[:, None]) / field.step

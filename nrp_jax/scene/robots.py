@@ -27,10 +27,10 @@ class Footprint:
 
 
 @pytree
-class Plates:
+class PlanarBoxes:
     """Flat rectangular links that move in the plane."""
 
-    centre: jax.Array  # (M, 2) in the links' frames [m]
+    center: jax.Array  # (M, 2) in the links' frames [m]
     half: jax.Array  # (M, 2) half sides [m]
     link: tuple[int, ...] = static()  # (M,)
     pairs: tuple[tuple[int, int], ...] = static()  # (P, 2) which are checked against each other
@@ -46,10 +46,10 @@ class MobileRobot:
     chain: Chain
     lower: jax.Array  # (A,) [rad] or [m]
     upper: jax.Array  # (A,) [rad] or [m]
-    wraps: jax.Array  # (D,) bool, joints that turn for ever
+    is_continuous: jax.Array  # (D,) bool, joints that turn for ever
     cover: Spheres  # cover the robot but for its footprint: checked against obstacles
     pairs: jax.Array  # (P, 2) i32 indices into ``cover``: which are checked against each other
-    plates: Plates | None  # checked against each other instead, if there are any
+    plates: PlanarBoxes | None  # checked against each other instead, if there are any
     footprint: Footprint | None
     feature_link: jax.Array  # (F,) i32
     feature_point: jax.Array  # (F, 3) in the link's frame [m]
@@ -122,7 +122,7 @@ def load_robot(name: str) -> MobileRobot:
         chain=chain,
         lower=jnp.asarray(lower, jnp.float32),
         upper=jnp.asarray(upper, jnp.float32),
-        wraps=jnp.asarray(~limited & angular),
+        is_continuous=jnp.asarray(~limited & angular),
         cover=cover,
         pairs=jnp.asarray(_checked_pairs(model, owner[: 0 if planar else None]), jnp.int32),
         plates=_plates(model, body_link, body_in_link) if planar else None,
@@ -147,12 +147,12 @@ def _footprint(model: mujoco.MjModel, body_link: np.ndarray) -> Footprint:
     )
 
 
-def _plates(model: mujoco.MjModel, body_link: np.ndarray, body_in_link: np.ndarray) -> Plates:
+def _plates(model: mujoco.MjModel, body_link: np.ndarray, body_in_link: np.ndarray) -> PlanarBoxes:
     geoms = np.flatnonzero(model.geom_contype)
     body = model.geom_bodyid[geoms]
-    centre = np.einsum("nij,nj->ni", body_in_link[body, :3, :3], model.geom_pos[geoms])
-    return Plates(
-        centre=jnp.asarray((centre + body_in_link[body, :3, 3])[:, :2], jnp.float32),
+    center = np.einsum("nij,nj->ni", body_in_link[body, :3, :3], model.geom_pos[geoms])
+    return PlanarBoxes(
+        center=jnp.asarray((center + body_in_link[body, :3, 3])[:, :2], jnp.float32),
         half=jnp.asarray(model.geom_size[geoms, :2], jnp.float32),
         link=tuple(body_link[body].tolist()),
         pairs=tuple(map(tuple, _checked_pairs(model, geoms).tolist())),
@@ -169,9 +169,9 @@ def _cover(
     grain: np.ndarray,
 ) -> tuple[Spheres, np.ndarray]:
     """Spheres that cover some geoms, in the links' frames, and the geom of each."""
-    link, centre, radius, owner = [], [], [], []
+    link, center, radius, owner = [], [], [], []
     for geom in geoms:
-        centres, radii = cover_geom(
+        centers, radii = cover_geom(
             mujoco.mjtGeom(model.geom_type[geom]),
             model.geom_size[geom] * ([1, 1, 0] if planar else [1, 1, 1]),
             float(grain[geom]),
@@ -179,15 +179,15 @@ def _cover(
         body = model.geom_bodyid[geom]
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-        in_body = centres @ rotation.reshape(3, 3).T + model.geom_pos[geom]
+        in_body = centers @ rotation.reshape(3, 3).T + model.geom_pos[geom]
         pose = body_in_link[body]
-        centre.append(in_body @ pose[:3, :3].T + pose[:3, 3])
+        center.append(in_body @ pose[:3, :3].T + pose[:3, 3])
         radius.append(radii)
-        link += [body_link[body]] * len(centres)
-        owner += [geom] * len(centres)
+        link += [body_link[body]] * len(centers)
+        owner += [geom] * len(centers)
     spheres = Spheres(
         link=jnp.asarray(np.array(link), jnp.int32),
-        centre=jnp.asarray(np.concatenate(centre), jnp.float32),
+        center=jnp.asarray(np.concatenate(center), jnp.float32),
         radius=jnp.asarray(np.concatenate(radius), jnp.float32),
     )
     return spheres, np.array(owner)
@@ -204,7 +204,7 @@ def cover_geom(
         grain: half the longest side of a brick, half the longest way between two spheres [m].
 
     Returns:
-        Centres (n, 3) in the geom's frame and radii (n,).
+        Centers (n, 3) in the geom's frame and radii (n,).
 
     Raises:
         ValueError: another kind.
@@ -214,14 +214,14 @@ def cover_geom(
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
         radius, half = size[:2]
         count = int(np.ceil(half / grain - 1e-6))
-        centres = np.zeros((count + 1, 3))
-        centres[:, 2] = np.linspace(-half, half, count + 1)
-        return centres, np.full(count + 1, np.hypot(radius, half / count))
+        centers = np.zeros((count + 1, 3))
+        centers[:, 2] = np.linspace(-half, half, count + 1)
+        return centers, np.full(count + 1, np.hypot(radius, half / count))
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
         counts = np.maximum(np.ceil(size / grain - 1e-6), 1).astype(int)
         ticks = [h * (2 * np.arange(n) + 1 - n) / n for h, n in zip(size, counts, strict=True)]
-        centres = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-        return centres, np.full(len(centres), np.linalg.norm(size / counts))
+        centers = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+        return centers, np.full(len(centers), np.linalg.norm(size / counts))
     raise ValueError(f"geom of kind {kind.name}: expected spheres, capsules and boxes")
 
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from nrp_jax.homes.grid import Grid
 from nrp_jax.scene import reeds_shepp
-from nrp_jax.scene.field import Field, make_field, room
-from nrp_jax.scene.robots import MobileRobot, Plates
-from vrrt_jax.core.edges import Straight, joint_steps
+from nrp_jax.scene.field import DistanceField, clearance_bound, make_field
+from nrp_jax.scene.robots import MobileRobot, PlanarBoxes
+from vrrt_jax.core.edges import StraightLineEdges, joint_steps
 from vrrt_jax.core.types import pytree, static
 from vrrt_jax.robots.kinematics import Chain, Spheres, link_poses, place, placement
 
@@ -25,14 +25,14 @@ SHORTLIST = 16  # nodes for which the length of a curve is computed
 class RoundBase:
     """A round base among the cells that are low enough to be in its way."""
 
-    field: Field  # planar
+    field: DistanceField  # planar
     radius: jax.Array  # () [m]
     height: jax.Array  # () [m]
     link: int = static()
 
 
 @pytree
-class GridWorld(Straight):
+class GridWorld(StraightLineEdges):
     """What planners ask about a robot on a sliding base in a home; edges are straight.
 
     An edge's length is that of the base's way plus ``arm_weight`` times that of the arm's; its
@@ -41,16 +41,16 @@ class GridWorld(Straight):
 
     chain: Chain
     cover: jax.Array  # (L * 12, 3 n) placement of the covering spheres
-    cover_radius: jax.Array  # (n,) [m]
-    floor: jax.Array  # (n,) lowest height of their centres, -inf if they may touch the floor [m]
-    plates: Plates | None  # checked against each other instead
+    collision_radius: jax.Array  # (n,) [m]
+    floor: jax.Array  # (n,) lowest height of their centers, -inf if they may touch the floor [m]
+    plates: PlanarBoxes | None  # checked against each other instead
     reach: jax.Array  # (m, n) at which the last m touch others, 0 for pairs not checked [m]
     base: RoundBase | None
-    field: Field
+    field: DistanceField
     lower: jax.Array  # (D,)
     upper: jax.Array  # (D,)
-    wraps: jax.Array  # (D,) bool
-    arm_weight: jax.Array  # () metres a radian of the arm counts for
+    is_continuous: jax.Array  # (D,) bool
+    arm_weight: jax.Array  # () meters a radian of the arm counts for
     resolution: jax.Array  # () longest sub-step of any joint [m] or [rad]
 
     def is_free(self, q: jax.Array) -> jax.Array:
@@ -59,8 +59,8 @@ class GridWorld(Straight):
 
     def interpolate(self, q_a: jax.Array, q_b: jax.Array, fraction: jax.Array) -> jax.Array:
         """Configurations (..., D) at a fraction (...) of the edges between others (..., D)."""
-        part = self.part(self.edge(q_a, q_b), jnp.asarray(fraction, q_a.dtype))
-        return self.normalise(self.end(q_a, part))
+        part = self.truncate(self.edge(q_a, q_b), jnp.asarray(fraction, q_a.dtype))
+        return self.normalize(self.end(q_a, part))
 
     def distances(self, nodes: jax.Array, q: jax.Array, among: jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`."""
@@ -80,18 +80,18 @@ class GridWorld(Straight):
 
     def steer(self, q_from: jax.Array, target: jax.Array, num_steps: int) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`."""
-        inside = jnp.where(self.wraps, target, jnp.clip(target, self.lower, self.upper))
+        inside = jnp.where(self.is_continuous, target, jnp.clip(target, self.lower, self.upper))
         edge = self.edge(q_from, inside)
         longest = num_steps * self.resolution
-        return self.part(edge, jnp.minimum(1.0, longest / jnp.maximum(self.span(edge), 1e-9)))
+        return self.truncate(edge, jnp.minimum(1.0, longest / jnp.maximum(self.span(edge), 1e-9)))
 
-    def checkable(self, edge: jax.Array, num_steps: int | jax.Array) -> jax.Array:
+    def is_resolved(self, edge: jax.Array, num_steps: int | jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`."""
         return self.span(edge) <= num_steps * self.resolution * (1 + 1e-5)
 
     def parts(self, edge: Any, most: int) -> jax.Array:
-        """Fewest parts (...) of an edge that are checkable each; ``most + 1`` if it takes more."""
-        enough = jax.vmap(self.checkable, (None, 0))(edge, jnp.arange(1, most + 1))
+        """Fewest parts (...) of an edge that are resolved each; ``most + 1`` if it takes more."""
+        enough = jax.vmap(self.is_resolved, (None, 0))(edge, jnp.arange(1, most + 1))
         return 1 + jnp.sum(~enough, axis=0)
 
 
@@ -114,7 +114,7 @@ class CarWorld(GridWorld):
     def distance(self, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`."""
         drive = reeds_shepp.length(q_a[..., :3], q_b[..., :3], self.radius)
-        arm = Straight.edge(self, q_a, q_b)[..., 3:]
+        arm = StraightLineEdges.edge(self, q_a, q_b)[..., 3:]
         return drive + self.arm_weight * _norm(arm)
 
     def distances(self, nodes: jax.Array, q: jax.Array, among: jax.Array) -> jax.Array:
@@ -140,7 +140,7 @@ class CarWorld(GridWorld):
 
     def edge(self, q_from: jax.Array, q_to: jax.Array) -> CarEdge:
         """See :class:`vrrt_jax.core.edges.Space`."""
-        step = Straight.edge(self, q_from, q_to)
+        step = StraightLineEdges.edge(self, q_from, q_to)
         return CarEdge(
             curve=reeds_shepp.shortest(q_from[..., :3], q_to[..., :3], self.radius),
             arm=step[..., 3:],
@@ -148,7 +148,7 @@ class CarWorld(GridWorld):
             done=jnp.ones(step.shape[:-1], step.dtype),
         )
 
-    def part(self, edge: CarEdge, fraction: jax.Array) -> CarEdge:
+    def truncate(self, edge: CarEdge, fraction: jax.Array) -> CarEdge:
         """See :class:`vrrt_jax.core.edges.Space`."""
         return CarEdge(
             curve=reeds_shepp.cut(edge.curve, fraction, self.radius),
@@ -183,31 +183,31 @@ def is_free(world: GridWorld, q: jax.Array) -> jax.Array:
     """
     poses = link_poses(world.chain, q)
     # The barrier keeps XLA's CPU fusions from placing the spheres once for every use.
-    centres = jax.lax.optimization_barrier(place(world.cover, poses))
-    first = world.reach.shape[1] - world.reach.shape[0]
-    apart = sum((axis[first:, None] - axis) ** 2 for axis in centres)
-    free = jnp.all(apart >= world.reach**2)
-    free &= jnp.all(room(world.field, centres) > world.cover_radius)
-    free &= jnp.all(centres[2] > world.floor)
+    centers = jax.lax.optimization_barrier(place(world.collision_spheres, poses))
+    first = world.contact_distance.shape[1] - world.contact_distance.shape[0]
+    apart = sum((axis[first:, None] - axis) ** 2 for axis in centers)
+    free = jnp.all(apart >= world.contact_distance**2)
+    free &= jnp.all(clearance_bound(world.field, centers) > world.collision_radius)
+    free &= jnp.all(centers[2] > world.floor)
     if world.plates is not None:
         free &= _plates_apart(world.plates, poses)
     if world.base is not None:
-        free &= _base_is_free(world.base, poses, centres, world.cover_radius, world.floor)
+        free &= _base_is_free(world.base, poses, centers, world.collision_radius, world.floor)
     return free
 
 
 batch_is_free = jax.jit(jax.vmap(is_free, (None, 0)))  # of q (n, D), for the host
 
 
-def _plates_apart(plates: Plates, poses: jax.Array) -> jax.Array:
+def _plates_apart(plates: PlanarBoxes, poses: jax.Array) -> jax.Array:
     """Whether no two of the checked plates overlap: some side separates them."""
     pose = poses[jnp.array(plates.link)]
     cosine, sine = pose[:, 0, 0], pose[:, 1, 0]
-    centre = jnp.einsum("mij,mj->mi", pose[:, :2, :2], plates.centre) + pose[:, :2, 3]
+    center = jnp.einsum("mij,mj->mi", pose[:, :2, :2], plates.center) + pose[:, :2, 3]
     pairs = jnp.array(plates.pairs).T
     (c_i, c_j), (s_i, s_j), (half_i, half_j) = cosine[pairs], sine[pairs], plates.half[pairs]
     turned = jnp.abs(jnp.stack([c_i * c_j + s_i * s_j, c_i * s_j - s_i * c_j]))
-    dx, dy = (centre[pairs[1]] - centre[pairs[0]]).T
+    dx, dy = (center[pairs[1]] - center[pairs[0]]).T
     apart = jnp.zeros(len(plates.pairs), bool)
     for (c, s), own, other in (((c_i, s_i), half_i, half_j), ((c_j, s_j), half_j, half_i)):
         ahead, beside = jnp.abs(c * dx + s * dy), jnp.abs(c * dy - s * dx)
@@ -217,14 +217,14 @@ def _plates_apart(plates: Plates, poses: jax.Array) -> jax.Array:
 
 
 def _base_is_free(
-    base: RoundBase, poses: jax.Array, centres: jax.Array, radius: jax.Array, floor: jax.Array
+    base: RoundBase, poses: jax.Array, centers: jax.Array, radius: jax.Array, floor: jax.Array
 ) -> jax.Array:
     """Whether a cylinder touches neither a cell nor the spheres that must not touch the floor."""
     position = poses[base.link, :3, 3:]
-    beside = jnp.sqrt(jnp.sum((centres[:2] - position[:2]) ** 2, axis=0)) - base.radius
-    above = centres[2] - base.height
+    beside = jnp.sqrt(jnp.sum((centers[:2] - position[:2]) ** 2, axis=0)) - base.radius
+    above = centers[2] - base.height
     gap = jnp.maximum(beside, 0.0) ** 2 + jnp.maximum(above, 0.0) ** 2
-    return (room(base.field, position)[0] > base.radius) & jnp.all(
+    return (clearance_bound(base.field, position)[0] > base.radius) & jnp.all(
         (gap > radius**2) | jnp.isinf(floor)
     )
 
@@ -244,10 +244,10 @@ def build_world(
         robot: from :func:`nrp_jax.load_robot`.
         grid: from :func:`nrp_jax.load_map` or a generator; the snake sees its planar map.
         wrap: joints without limits turn the short way round; otherwise they are intervals, as in
-            the paper. A heading always wraps.
+            the paper. A heading always is_continuous.
         resolution: longest sub-step of any joint between two collision checks [m] or [rad]; the
             paper's by default.
-        arm_weight: metres that a radian of the arm counts for in the metric; the paper's by
+        arm_weight: meters that a radian of the arm counts for in the metric; the paper's by
             default.
         turning_radius: smallest one of a base that drives like a car [m].
 
@@ -264,15 +264,15 @@ def build_world(
         if not value > 0:
             raise ValueError(f"{name} is {value}; expected a positive number, such as 0.1")
     grid = _fitting(robot.planar, grid)
-    is_arm = np.asarray(robot.cover.link) > robot.base_dim + 1
-    floor = np.where(is_arm & (not robot.planar), robot.cover.radius, -np.inf)
+    is_arm = np.asarray(robot.collision_spheres.link) > robot.base_dim + 1
+    floor = np.where(is_arm & (not robot.planar), robot.collision_spheres.radius, -np.inf)
     turn = [np.pi] * (robot.base_dim - 2)
     is_base = np.arange(robot.num_joints) < robot.base_dim
     corner = np.array(grid.origin[:2])
     fields = {
         "chain": robot.chain,
-        "cover": _placement(robot.cover, robot.chain),
-        "cover_radius": robot.cover.radius,
+        "cover": _placement(robot.collision_spheres, robot.chain),
+        "collision_radius": robot.collision_spheres.radius,
         "floor": jnp.asarray(floor, jnp.float32),
         "plates": robot.plates,
         "reach": jnp.asarray(_reach(robot)),
@@ -280,7 +280,7 @@ def build_world(
         "field": make_field(grid),
         "lower": _float(np.concatenate([corner, np.negative(turn), robot.lower])),
         "upper": _float(np.concatenate([corner + grid.size[:2], turn, robot.upper])),
-        "wraps": robot.wraps & (is_base | wrap),
+        "is_continuous": robot.is_continuous & (is_base | wrap),
         "arm_weight": jnp.float32(arm_weight),
         "resolution": jnp.float32(resolution),
     }
@@ -332,7 +332,10 @@ def _fitting(planar: bool, grid: Grid) -> Grid:
 
 def _reach(robot: MobileRobot) -> np.ndarray:
     """Sums of the radii (m, n) of pairs of the last m of n spheres with any; 0 if not checked."""
-    radius, (first, second) = np.asarray(robot.cover.radius), np.asarray(robot.pairs).T
+    radius, (first, second) = (
+        np.asarray(robot.collision_spheres.radius),
+        np.asarray(robot.self_collision_pairs).T,
+    )
     if not len(first):
         return np.zeros((0, len(radius)), np.float32)
     reach = np.zeros((len(radius),) * 2, np.float32)
@@ -352,12 +355,12 @@ def _round_base(robot: MobileRobot, grid: Grid) -> RoundBase | None:
     )
 
 
-def _low_field(grid: Grid, height: float) -> Field:
+def _low_field(grid: Grid, height: float) -> DistanceField:
     return make_field(grid.flatten(0.0, height))
 
 
 def _placement(spheres: Spheres, chain: Chain) -> jax.Array:
-    matrix = placement(np.asarray(spheres.link), np.asarray(spheres.centre), chain.num_links)
+    matrix = placement(np.asarray(spheres.link), np.asarray(spheres.center), chain.num_links)
     return _float(matrix)
 
 

@@ -29,7 +29,7 @@ def snake():
 
 @pytest.fixture(scope="module")
 def home():
-    """Two rooms and a door of one metre."""
+    """Two rooms and a door of one meter."""
     occupied = np.zeros((50, 40), bool)
     occupied[24:26] = True
     occupied[24:26, 25:35] = False
@@ -116,7 +116,7 @@ def test_same_key_same_plan(solve):
 
 
 def test_budget_and_capacity(solve):
-    assert solve("rrt", max_expansions=32, goal_bias=0.0).status is Status.BUDGET
+    assert solve("rrt", max_expansions=32, goal_bias=0.0).status is Status.MAX_ITERATIONS
     assert solve("rrt-is", capacity=64, goal_bias=0.0).status is Status.TREE_FULL
 
 
@@ -166,13 +166,13 @@ def test_the_shortest_drive_has_no_shortcuts():
 
 def test_headings_of_a_trajectory_go_on(snake, home):
     world = nrp_jax.build_world(snake, home)
-    wraps = np.asarray(world.wraps)
-    assert wraps.any()
+    is_continuous = np.asarray(world.is_continuous)
+    assert is_continuous.any()
     ends = np.stack([START, START]).astype(np.float32)
-    ends[:, wraps] = np.array([[3.0], [-3.0]])
+    ends[:, is_continuous] = np.array([[3.0], [-3.0]])
     trajectory = trajectory_of(world, ends)
     assert np.abs(np.diff(trajectory, axis=0)).max() <= 0.02 + 1e-5
-    np.testing.assert_allclose(trajectory[-1, wraps], 2 * np.pi - 3.0, atol=1e-5)
+    np.testing.assert_allclose(trajectory[-1, is_continuous], 2 * np.pi - 3.0, atol=1e-5)
 
 
 def test_verification_sees_what_is_wrong(snake, home, scene, solve):

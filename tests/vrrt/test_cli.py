@@ -158,7 +158,11 @@ def test_self_models_come_back(tmp_path):
     assert copy.info == packed.info and copy.joint_names == packed.joint_names
     of_packed, of_copy = (*packed.levels, packed.close_up), (*copy.levels, copy.close_up)
     for a, b in zip(of_packed, of_copy, strict=True):
-        assert (a.size_px, a.psnr_db, a.match_bar) == (b.size_px, b.psnr_db, b.match_bar)
+        assert (a.size_px, a.psnr_db, a.match_threshold) == (
+            b.size_px,
+            b.psnr_db,
+            b.match_threshold,
+        )
         np.testing.assert_allclose(a.splats.mean, b.splats.mean, atol=1e-3)
     assert [level.size_px for level in packed.levels] == [32, 64, 128, 256]
     assert packed.level_for(40).size_px == 64 and packed.level_for(900).size_px == 256

@@ -3,7 +3,7 @@
 Dr.Robot (Liu et al., CoRL 2024) follows the image gradient from the start; its iterates are the
 path. Prof.Robot (CVPR 2025) adds a penalty from a collision classifier, learned per scene
 with an Eikonal term that keeps its gradient alive. All use the renderer, the self-models and the
-optimiser of Visual-RRT.
+optimizer of Visual-RRT.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ import optax
 
 from vrrt_jax import checks
 from vrrt_jax.config import PlannerConfig
-from vrrt_jax.core.edges import into_limits, joint_error
+from vrrt_jax.core.edges import enforce_bounds, joint_error
 from vrrt_jax.core.types import pytree
 from vrrt_jax.planner import plan_to_configuration
 from vrrt_jax.robots.robot import Robot
@@ -31,7 +31,7 @@ from vrrt_jax.visual.goal import Sight, visual_policy
 from vrrt_jax.visual.policy import VisualPolicy
 
 WIDTH, DEPTH, JOINT_FEATURES = 128, 4, 8  # of the classifier; the paper's is 512 wide
-SAMPLES = 200_000  # labelled configurations; the paper has 10 million
+SAMPLES = 200_000  # labeled configurations; the paper has 10 million
 TRAIN_STEPS, TRAIN_BATCH, LEARNING_RATE = 1500, 4096, 1e-3
 EIKONAL = 0.1  # weight of (|grad g| - 1)^2, as in the published code
 PENALTY, PENALTY_MARGIN = 5.0, 0.1  # the planner's 5 relu(g + 0.1), likewise
@@ -65,12 +65,12 @@ class Classifier:
     """A learned ``g(q)``, positive in collision."""
 
     params: Any
-    centre: jax.Array  # (D,) of the joints' ranges
+    center: jax.Array  # (D,) of the joints' ranges
     scale: jax.Array  # (D,) half of them
 
     def __call__(self, q: jax.Array) -> jax.Array:
         """Sign of collision () of a configuration (D,); about a distance [rad]."""
-        return jnp.asarray(_Network().apply(self.params, (q - self.centre) / self.scale))
+        return jnp.asarray(_Network().apply(self.params, (q - self.center) / self.scale))
 
 
 class _Network(nn.Module):
@@ -107,13 +107,13 @@ def train_classifier(robot: Robot, world: World, *, seed: int = 0) -> tuple[Clas
     labels = jnp.concatenate([~batch_is_free(world, part) for part in jnp.array_split(q, 100)])
     classifier = Classifier(
         params=_Network().init(key, jnp.zeros(len(low))),
-        centre=(low + high) / 2,
+        center=(low + high) / 2,
         scale=(high - low) / 2,
     )
-    optimiser = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, TRAIN_STEPS))
+    optimizer = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, TRAIN_STEPS))
     share = jnp.mean(labels[:SAMPLES])
     weight = jnp.where(labels, 0.5 / share, 0.5 / (1.0 - share))
-    params = _train(classifier, optimiser, q[:SAMPLES], labels[:SAMPLES], weight[:SAMPLES], key)
+    params = _train(classifier, optimizer, q[:SAMPLES], labels[:SAMPLES], weight[:SAMPLES], key)
     classifier = dataclasses.replace(classifier, params=params)
     right = (jax.jit(jax.vmap(classifier))(q[SAMPLES:]) > 0) == labels[SAMPLES:]
     held_out = labels[SAMPLES:]
@@ -122,7 +122,7 @@ def train_classifier(robot: Robot, world: World, *, seed: int = 0) -> tuple[Clas
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _train(classifier, optimiser, q, labels, weight, key):
+def _train(classifier, optimizer, q, labels, weight, key):
     """Parameters after balanced cross entropy with the Eikonal term; the sharpness is learned."""
 
     def loss(trained, rows):
@@ -137,11 +137,11 @@ def _train(classifier, optimiser, q, labels, weight, key):
     def step(i, carry):
         trained, state = carry
         rows = jax.random.randint(jax.random.fold_in(key, i), (TRAIN_BATCH,), 0, len(q))
-        updates, state = optimiser.update(jax.grad(loss)(trained, rows), state)
+        updates, state = optimizer.update(jax.grad(loss)(trained, rows), state)
         return optax.apply_updates(trained, updates), state
 
     trained = (classifier.params, jnp.log(10.0))
-    trained, _ = jax.lax.fori_loop(0, TRAIN_STEPS, step, (trained, optimiser.init(trained)))
+    trained, _ = jax.lax.fori_loop(0, TRAIN_STEPS, step, (trained, optimizer.init(trained)))
     return trained[0]
 
 
@@ -207,7 +207,7 @@ def _chain(world, policy: VisualPolicy, classifier, q, numbers, steps):
         (_, loss), gradient = jax.value_and_grad(objective, has_aux=True)(q)
         path, losses = path.at[i].set(q), losses.at[i].set(loss)
         direction, state = adam.update(gradient, state)
-        return into_limits(world, q - alpha * direction), state, path, losses
+        return enforce_bounds(world, q - alpha * direction), state, path, losses
 
     path = jnp.zeros((MAX_STEPS, len(q)))
     losses = jnp.full(MAX_STEPS, jnp.inf)

@@ -56,7 +56,7 @@ def run(batch: int = 1024, repeats: int = 30) -> dict:
     return {
         "batch": batch,
         "num_obstacles": 8,
-        "num_cover_spheres": len(robot.cover.radius),
+        "num_cover_spheres": len(robot.collision_spheres.radius),
         **{f"{name}_ms": round(value, 3) for name, value in times.items()},
         "compile_s": round(compile_s, 2),
         "user_jit_ratio": round(times["user_jit"] / times["best"], 3),

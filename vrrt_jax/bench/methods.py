@@ -110,7 +110,7 @@ def solve(
     if method == "vrrt":
         noise = np.random.default_rng(task_seed).normal(size=robot.num_joints)
         guess = task.q_goal + guess_sigma * noise
-        guess = np.where(robot.wraps, guess, np.clip(guess, robot.lower, robot.upper))
+        guess = np.where(robot.is_continuous, guess, np.clip(guess, robot.lower, robot.upper))
         attempt = _plan(inputs, key, config, masks, guess if guess_sigma > 0 else None)
     else:
         attempt = _baseline(inputs, robot_name, task, method, key, masks)

@@ -76,18 +76,18 @@ def run(
 
 def random_splats(robot: Robot, num_splats: int, rng: np.random.Generator) -> SplatModel:
     """Splats all over the spheres that cover a robot."""
-    cover = robot.cover
+    cover = robot.collision_spheres
     radius = np.asarray(cover.radius)
     sphere = np.sort(rng.choice(len(radius), num_splats, p=radius**2 / np.sum(radius**2)))
     sphere = sphere[np.argsort(np.asarray(cover.link)[sphere], kind="stable")]
     normal = rng.normal(size=(num_splats, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     arrays = {
-        "mean": np.asarray(cover.centre)[sphere] + radius[sphere, None] * normal,
+        "mean": np.asarray(cover.center)[sphere] + radius[sphere, None] * normal,
         "radius": rng.uniform(0.012, 0.02, num_splats),
         "density": rng.uniform(1.0, 3.0, num_splats),
         "rgb": rng.uniform(size=(num_splats, 3)),
-        "shade": 0.2 * normal,
+        "view_color_gradient": 0.2 * normal,
     }
     link = np.asarray(cover.link)[sphere]
     return SplatModel(

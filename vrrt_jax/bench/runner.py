@@ -50,7 +50,7 @@ class Benchmark:
 
     @property
     def collisions(self) -> bool:
-        """Whether there are obstacles, and paths are judged."""
+        """Whether there are obstacles, and paths are max_scored."""
         return self.what != "pose"
 
     def header(self) -> dict[str, Any]:
@@ -192,7 +192,7 @@ def _write(file: Path, results: dict[str, Any]) -> None:
 def _summary(benchmark: Benchmark, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Success and more by level; of an ablation, by variant."""
     by_variant = {
-        variant.name: summarise([row for row in rows if row["variant"] == variant.name])
+        variant.name: summarize([row for row in rows if row["variant"] == variant.name])
         for variant in benchmark.variants
     }
     if len(by_variant) == 1:
@@ -200,7 +200,7 @@ def _summary(benchmark: Benchmark, rows: Sequence[dict[str, Any]]) -> dict[str, 
     return {"by_variant": by_variant}
 
 
-def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def summarize(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """``average_success``, the mean of the levels', and ``levels``."""
     levels = []
     for level in sorted({row["level"] for row in rows}):

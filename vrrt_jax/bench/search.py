@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax import planner
-from vrrt_jax.core.edges import free_along, joint_error
+from vrrt_jax.core.edges import free_prefix, joint_error
 from vrrt_jax.core.expand import expand
-from vrrt_jax.core.search import make_stop, search
+from vrrt_jax.core.search import make_termination, search
 from vrrt_jax.core.timing import interleaved_ms
 from vrrt_jax.core.types import Expansion
 from vrrt_jax.problems import Problem, load_problem, problem_names
@@ -37,7 +37,12 @@ def iteration_split(problem: Problem, repeats: int = 15) -> dict:
     q_start = problem.q_start[None]
     tree = plant(world, policy, setup.probing, q_start, key, config.capacity)
     found = search(
-        world, policy, tree, key=key, stop=make_stop(-1.0, max_iterations=40), time_limit_s=60.0
+        world,
+        policy,
+        tree,
+        key=key,
+        stop=make_termination(-1.0, max_iterations=40),
+        time_limit_s=60.0,
     )
     tree = found.tree
     proposals = jax.jit(policy.propose)(world, tree, key)
@@ -55,7 +60,7 @@ def iteration_split(problem: Problem, repeats: int = 15) -> dict:
         "gradient": (lambda p, w, *rest: p.evaluate(w, *rest), (policy, world, parents, proposals)),
         "propose": (lambda p, *rest: p.propose(*rest), (policy, world, tree, key)),
         "edges": (
-            lambda w, a, b: free_along(w, a, b, policy.edge_steps),
+            lambda w, a, b: free_prefix(w, a, b, policy.edge_steps),
             (world, parents, proposals.target - parents),
         ),
         "rewire": (

@@ -259,11 +259,11 @@ def _cause_shares(levels: Sequence[dict[str, Any]]) -> list[float]:
     ]
 
 
-def _stack_bars(axis, labels: Sequence[str], stacks: Sequence[Sequence[float]], names, colours):
-    """A bar for each label, the first on top, of parts with a name and a colour each."""
+def _stack_bars(axis, labels: Sequence[str], stacks: Sequence[Sequence[float]], names, colors):
+    """A bar for each label, the first on top, of parts with a name and a color each."""
     left = np.zeros(len(labels))
-    for width, name, colour in zip(np.transpose(stacks), names, colours, strict=True):
-        axis.barh(labels, width, left=left, color=colour, label=name)
+    for width, name, color in zip(np.transpose(stacks), names, colors, strict=True):
+        axis.barh(labels, width, left=left, color=color, label=name)
         left += width
     axis.invert_yaxis()
 

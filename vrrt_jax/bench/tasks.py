@@ -7,7 +7,7 @@ import zlib
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.edges import into_limits
+from vrrt_jax.core.edges import enforce_bounds
 from vrrt_jax.problems import load_world
 from vrrt_jax.robots import Robot, load_robot
 from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
@@ -96,8 +96,8 @@ def make_task(robot_name: str, level: float, index: int, seed: int, *, obstacles
         q_start = rng.uniform(robot.lower, robot.upper, (256, robot.num_joints))
         step = rng.normal(size=q_start.shape)
         q_goal = q_start + level * step / np.linalg.norm(step, axis=1, keepdims=True)
-        inside = robot.wraps | ((q_goal > robot.lower) & (q_goal < robot.upper))
-        q_goal = np.asarray(into_limits(world, jnp.asarray(q_goal, jnp.float32)))
+        inside = robot.is_continuous | ((q_goal > robot.lower) & (q_goal < robot.upper))
+        q_goal = np.asarray(enforce_bounds(world, jnp.asarray(q_goal, jnp.float32)))
         free = [
             np.asarray(batch_is_free(world, jnp.asarray(q, jnp.float32))) for q in (q_start, q_goal)
         ]
@@ -123,13 +123,13 @@ def make_task(robot_name: str, level: float, index: int, seed: int, *, obstacles
 @functools.cache
 def cameras(robot_name: str, scenery: Scenery) -> tuple[Camera, ...]:
     """The views of a robot's workspace."""
-    centre, radius = workspace(bench_robot(robot_name))
+    center, radius = workspace(bench_robot(robot_name))
     return tuple(
         orbit(
             azimuth_deg=azimuth + scenery.azimuth_deg,
             elevation_deg=ELEVATION_DEG,
             distance=DISTANCE * radius,
-            target=centre.tolist(),
+            target=center.tolist(),
             height=IMAGE_PX,
             width=IMAGE_PX,
         )
@@ -156,7 +156,7 @@ def goal_images(
         picture = renderer.picture(task.q_goal, camera)
         images.append(np.concatenate([picture.rgb, picture.coverage[..., None]], axis=-1))
         masks.append(picture.valid)
-    # The robot comes over black; a goal image has straight colours beside its mask.
+    # The robot comes over black; a goal image has straight colors beside its mask.
     for image in images:
         image[..., :3] /= np.maximum(image[..., 3:], 1e-3)
         np.clip(image, 0.0, 1.0, out=image)

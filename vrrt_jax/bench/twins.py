@@ -72,7 +72,7 @@ def _alike(robot: str, task: Task) -> float:
 def _is_nearer(robot_name: str, task: Task) -> bool:
     robot, world = bench_robot(robot_name), bench_world(robot_name, task.world)
     q = twin(robot_name, task).q_goal
-    if np.any(~robot.wraps & ((q < robot.lower) | (q > robot.upper))):
+    if np.any(~robot.is_continuous & ((q < robot.lower) | (q > robot.upper))):
         return False
     away, truly = (np.linalg.norm(joint_error(world, e, task.q_start)) for e in (q, task.q_goal))
     return bool(away < truly)
@@ -105,7 +105,7 @@ def draw(path: str | Path, level: float = 2.5, seed: int = 0) -> None:
 def _around(mask: np.ndarray, margin: int = 15) -> tuple[slice, slice]:
     """A square window around what a mask (H, W) shows."""
     low, high = (f(np.argwhere(mask), axis=0) for f in (np.min, np.max))
-    half, centre = int(np.max(high - low)) // 2 + margin, (low + high) // 2
-    first = np.maximum(centre - half, 0)
+    half, center = int(np.max(high - low)) // 2 + margin, (low + high) // 2
+    first = np.maximum(center - half, 0)
     y, x = (slice(int(a), int(b)) for a, b in zip(first, first + 2 * half, strict=True))
     return y, x

@@ -15,7 +15,7 @@ COUNT = (5, 10)  # obstacles, beside the floor
 KINDS = ("box", "sphere", "capsule", "cylinder")
 SIZE = (0.06, 0.14)  # [m] radii and half edges
 LENGTH = (0.15, 0.35)  # [m] half lengths of capsules and cylinders
-SHELL = (0.25, 0.85)  # distance of centres from the workspace's, in its radii
+SHELL = (0.25, 0.85)  # distance of centers from the workspace's, in its radii
 COLOURS = ((0.30, 0.50, 0.75), (0.85, 0.65, 0.25), (0.85, 0.45, 0.30), (0.45, 0.65, 0.45))
 MOST_DRAWS = 1000  # of an obstacle
 
@@ -27,7 +27,7 @@ def random_world(robot: Robot, seed: int) -> list[Obstacle]:
         ValueError: the robot touches itself or the floor at home.
     """
     rng = np.random.default_rng(seed)
-    centre, radius = workspace(robot)
+    center, radius = workspace(robot)
     floor = Obstacle(
         name="floor",
         kind="plane",
@@ -45,7 +45,7 @@ def random_world(robot: Robot, seed: int) -> list[Obstacle]:
     for _ in range(MOST_DRAWS):
         if len(obstacles) > num:
             return obstacles
-        obstacle = _random_obstacle(len(obstacles), centre, radius, rng)
+        obstacle = _random_obstacle(len(obstacles), center, radius, rng)
         touching = contacts(robot, [*obstacles, obstacle], robot.home, geometry="spheres")
         if obstacle.position[2] > 0.1 and not touching:
             obstacles.append(obstacle)
@@ -56,12 +56,12 @@ def random_world(robot: Robot, seed: int) -> list[Obstacle]:
 
 
 def _random_obstacle(
-    index: int, centre: np.ndarray, radius: float, rng: np.random.Generator
+    index: int, center: np.ndarray, radius: float, rng: np.random.Generator
 ) -> Obstacle:
     kind = KINDS[rng.integers(len(KINDS))]
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
-    position = centre + radius * rng.uniform(*SHELL) * direction
+    position = center + radius * rng.uniform(*SHELL) * direction
     a, b, c = rng.uniform(*SIZE, 3)
     size = {
         "box": (a, b, c),
@@ -93,9 +93,9 @@ def write_world(obstacles: Sequence[Obstacle], path: Path, comment: str = "") ->
     for obstacle in obstacles:
         fields = {"pos": obstacle.position, "quat": obstacle.quaternion, "size": obstacle.size}
         numbers = {key: " ".join(f"{v:g}" for v in value) for key, value in fields.items()}
-        colour = " ".join(f"{v:g}" for v in obstacle.rgba)
+        color = " ".join(f"{v:g}" for v in obstacle.rgba)
         ET.SubElement(
-            body, "geom", {"name": obstacle.name, "type": obstacle.kind, **numbers, "rgba": colour}
+            body, "geom", {"name": obstacle.name, "type": obstacle.kind, **numbers, "rgba": color}
         )
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n")

@@ -54,11 +54,11 @@ class Space(Protocol):
         """The edge towards a target inside the limits, cut to what ``num_steps`` can check."""
         ...
 
-    def checkable(self, edge: Edge, num_steps: int | jax.Array) -> jax.Array:
+    def is_resolved(self, edge: Edge, num_steps: int | jax.Array) -> jax.Array:
         """Whether (...) ``num_steps`` sub-steps are fine enough for an edge."""
         ...
 
-    def part(self, edge: Edge, fraction: jax.Array) -> Edge:
+    def truncate(self, edge: Edge, fraction: jax.Array) -> Edge:
         """The first fraction (...) of an edge."""
         ...
 
@@ -70,20 +70,20 @@ class Space(Protocol):
         """Where an edge leads to; wrapping joints may have passed pi."""
         ...
 
-    def normalise(self, q: jax.Array) -> jax.Array:
+    def normalize(self, q: jax.Array) -> jax.Array:
         """The same configuration, wrapping joints in [-pi, pi)."""
         ...
 
 
-class Straight:
+class StraightLineEdges:
     """Straight edges, the short way round for joints that wrap; the edge is the step (..., D).
 
-    For dataclasses with ``lower``, ``upper``, ``wraps`` (D,) and ``resolution`` ().
+    For dataclasses with ``lower``, ``upper``, ``is_continuous`` (D,) and ``resolution`` ().
     """
 
     lower: jax.Array
     upper: jax.Array
-    wraps: jax.Array
+    is_continuous: jax.Array
     resolution: jax.Array
 
     def distance(self, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
@@ -106,11 +106,11 @@ class Straight:
         """See :class:`Space`."""
         return steer(self, q_from, target, num_steps * self.resolution)
 
-    def checkable(self, edge: jax.Array, num_steps: int | jax.Array) -> jax.Array:
+    def is_resolved(self, edge: jax.Array, num_steps: int | jax.Array) -> jax.Array:
         """See :class:`Space`."""
         return self.length(edge) <= num_steps * self.resolution
 
-    def part(self, edge: jax.Array, fraction: jax.Array) -> jax.Array:
+    def truncate(self, edge: jax.Array, fraction: jax.Array) -> jax.Array:
         """See :class:`Space`."""
         return edge * fraction[..., None]
 
@@ -122,36 +122,36 @@ class Straight:
         """See :class:`Space`."""
         return q_from + edge
 
-    def normalise(self, q: jax.Array) -> jax.Array:
+    def normalize(self, q: jax.Array) -> jax.Array:
         """See :class:`Space`."""
-        return normalise(self, q)
+        return normalize(self, q)
 
 
-def joint_steps(space: Straight, nodes: jax.Array, q: jax.Array, joint: int) -> jax.Array:
+def joint_steps(space: StraightLineEdges, nodes: jax.Array, q: jax.Array, joint: int) -> jax.Array:
     """Steps (B, N) of one joint from ``q`` (B, D) to ``nodes`` (N, D)."""
-    return short_way(nodes[:, joint] - q[:, joint, None], space.wraps[joint])
+    return short_way(nodes[:, joint] - q[:, joint, None], space.is_continuous[joint])
 
 
-def short_way(step: jax.Array, wraps: jax.Array) -> jax.Array:
+def short_way(step: jax.Array, is_continuous: jax.Array) -> jax.Array:
     """The same steps (...), of joints that wrap the short way round."""
-    turns = jnp.where(wraps, jnp.round(step / (2 * jnp.pi)), 0.0)
+    turns = jnp.where(is_continuous, jnp.round(step / (2 * jnp.pi)), 0.0)
     return step - 2 * jnp.pi * turns
 
 
-def difference(world: Straight, q_from: jax.Array, q_to: jax.Array) -> jax.Array:
+def difference(world: StraightLineEdges, q_from: jax.Array, q_to: jax.Array) -> jax.Array:
     """The step (..., D) from one configuration to another, the short way round."""
-    return short_way(q_to - q_from, world.wraps)
+    return short_way(q_to - q_from, world.is_continuous)
 
 
-def joint_error(world: Straight, q: np.ndarray, q_goal: np.ndarray) -> np.ndarray:
+def joint_error(world: StraightLineEdges, q: np.ndarray, q_goal: np.ndarray) -> np.ndarray:
     """Distance (D,) of each joint from a goal, the short way round [rad] or [m]; on the host."""
     return np.abs(np.asarray(difference(world, jnp.asarray(q), jnp.asarray(q_goal))))
 
 
-def unwrapped(world: Straight, path: np.ndarray) -> np.ndarray:
+def unwrapped(world: StraightLineEdges, path: np.ndarray) -> np.ndarray:
     """The path (P, D) with joints that wrap going on, so that a controller may interpolate."""
-    path, wraps = np.array(path), np.asarray(world.wraps)
-    path[:, wraps] = np.unwrap(path[:, wraps], axis=0)
+    path, is_continuous = np.array(path), np.asarray(world.is_continuous)
+    path[:, is_continuous] = np.unwrap(path[:, is_continuous], axis=0)
     return path
 
 
@@ -160,19 +160,21 @@ def distance(world: Space, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
     return world.distance(q_a, q_b)
 
 
-def normalise(world: Straight, q: jax.Array) -> jax.Array:
+def normalize(world: StraightLineEdges, q: jax.Array) -> jax.Array:
     """Bring wrapping joints of (..., D) back to [-pi, pi)."""
-    turns = jnp.where(world.wraps, jnp.floor((q + jnp.pi) / (2 * jnp.pi)), 0.0)
+    turns = jnp.where(world.is_continuous, jnp.floor((q + jnp.pi) / (2 * jnp.pi)), 0.0)
     return q - 2 * jnp.pi * turns
 
 
-def into_limits(world: Straight, q: jax.Array) -> jax.Array:
+def enforce_bounds(world: StraightLineEdges, q: jax.Array) -> jax.Array:
     """The nearest configurations (..., D) inside the limits."""
-    return jnp.where(world.wraps, normalise(world, q), jnp.clip(q, world.lower, world.upper))
+    return jnp.where(
+        world.is_continuous, normalize(world, q), jnp.clip(q, world.lower, world.upper)
+    )
 
 
 def steer(
-    world: Straight, q_from: jax.Array, target: jax.Array, max_length: jax.Array
+    world: StraightLineEdges, q_from: jax.Array, target: jax.Array, max_length: jax.Array
 ) -> jax.Array:
     """The step (..., D) towards a target, inside the limits and no longer than ``max_length``.
 
@@ -180,17 +182,17 @@ def steer(
     """
     step = difference(world, q_from, target)
     inside = jnp.clip(q_from + step, world.lower, world.upper) - q_from
-    step = jnp.where(world.wraps, step, inside)
+    step = jnp.where(world.is_continuous, step, inside)
     length = jnp.sqrt(jnp.sum(step**2, axis=-1, keepdims=True))
     return step * jnp.minimum(1.0, max_length / jnp.maximum(length, 1e-12))
 
 
 def free_steps(world: Space, q_from: jax.Array, q_to: jax.Array, num_steps: int) -> jax.Array:
-    """How far one can go from one configuration to another: see :func:`free_along`."""
-    return free_along(world, q_from, world.edge(q_from, q_to), num_steps)
+    """How far one can go from one configuration to another: see :func:`free_prefix`."""
+    return free_prefix(world, q_from, world.edge(q_from, q_to), num_steps)
 
 
-def free_along(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) -> jax.Array:
+def free_prefix(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) -> jax.Array:
     """How far one can go along edges before something is touched.
 
     Args:
@@ -211,4 +213,4 @@ def points_along(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) ->
     """Configurations (B, S, D) at the far ends of S equal sub-steps of B edges."""
     fraction = jnp.arange(1, num_steps + 1, dtype=q_from.dtype) / num_steps
     edges = jax.tree.map(lambda leaf: leaf[:, None], edge)
-    return world.end(q_from[:, None], world.part(edges, fraction))
+    return world.end(q_from[:, None], world.truncate(edges, fraction))

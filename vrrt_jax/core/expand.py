@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import Space, free_along
+from vrrt_jax.core.edges import Space, free_prefix
 from vrrt_jax.core.types import Expansion, ExpansionPolicy, Payload, Rejection, Tree
 
 SHORTEST_EDGE = 1e-5  # [rad] a shorter step would only duplicate its parent
@@ -25,19 +25,19 @@ def expand(
             on how iterations are grouped into chunks.
     """
     proposals = policy.propose(world, tree, jax.random.fold_in(key, tree.iteration))
-    parent = jnp.where(proposals.ok, proposals.parent, 0)
+    parent = jnp.where(proposals.valid, proposals.parent, 0)
     q_from = tree.q[parent]
     edge = world.steer(q_from, proposals.target, policy.edge_steps)
 
-    passed = free_along(world, q_from, edge, policy.edge_steps)
+    passed = free_prefix(world, q_from, edge, policy.edge_steps)
     free = (passed == policy.edge_steps) | (proposals.partial & (passed > 0))
-    edge = world.part(edge, passed / policy.edge_steps)
+    edge = world.truncate(edge, passed / policy.edge_steps)
     length = world.length(edge)
-    q = world.normalise(world.end(q_from, edge))
+    q = world.normalize(world.end(q_from, edge))
 
     # A NaN target gives a NaN length: caught as not finite, before it can look like a limit.
     finite = jnp.isfinite(length)
-    candidate = proposals.ok & finite & free & (length > SHORTEST_EDGE)
+    candidate = proposals.valid & finite & free & (length > SHORTEST_EDGE)
     score, payload = policy.evaluate(world, jnp.where(candidate[:, None], q, q_from), proposals)
     finite &= jnp.isfinite(score)
     for leaf in jax.tree.leaves(payload):
@@ -55,7 +55,7 @@ def expand(
     )
     accepted = slot < tree.capacity
     reasons = (  # the first that holds, in the order of Rejection
-        ~proposals.ok,
+        ~proposals.valid,
         finite & free & (length <= SHORTEST_EDGE),
         finite & ~free,
         ~finite,

@@ -9,7 +9,7 @@ import jax
 from vrrt_jax.core.command import usable_cores
 
 
-def on_cores(function: Callable, items: Iterable[Any]) -> list[Any]:
+def map_on_threads(function: Callable, items: Iterable[Any]) -> list[Any]:
     """Results of a jitted function for every item, as NumPy arrays.
 
     On a CPU a program of ours runs on one core, and what is dispatched runs in turn. Threads that

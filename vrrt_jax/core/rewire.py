@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import Space, distance, free_along
+from vrrt_jax.core.edges import Space, distance, free_prefix
 from vrrt_jax.core.types import Expansion, Tree
 
 Payload = TypeVar("Payload")
@@ -38,7 +38,7 @@ def rewire(
         world: robot and obstacles.
         tree: the tree, with the new nodes in it.
         expansion: the new nodes.
-        radius: of the neighbourhood [rad]; no more than ``edge_steps`` times the resolution.
+        radius: of the neighborhood [rad]; no more than ``edge_steps`` times the resolution.
         edge_steps: sub-steps of an edge check (static).
         checks: edges of either kind that are checked (static).
 
@@ -49,13 +49,13 @@ def rewire(
     apart = trees.distances(world, tree, expansion.q)
     is_old = jnp.arange(tree.capacity) < tree.size - jnp.sum(expansion.accepted)
     near = expansion.accepted[:, None] & is_old & (apart < radius)
-    new = jnp.where(expansion.accepted, expansion.slot, 0)
+    new = jnp.where(expansion.accepted, expansion.node_index, 0)
 
     via = jnp.where(near, tree.cost + apart, jnp.inf)
     best, cost_via = jnp.argmin(via, axis=1), jnp.min(via, axis=1)
     lane, better = _largest(tree.cost[new] - cost_via, checks)
     better &= _edge_is_free(world, tree.q[best[lane]], expansion.q[lane], edge_steps)
-    slot = jnp.where(better, expansion.slot[lane], tree.capacity)
+    slot = jnp.where(better, expansion.node_index[lane], tree.capacity)
     parent = tree.parent.at[slot].set(best[lane].astype(jnp.int32), mode="drop")
     cost = tree.cost.at[slot].set(cost_via[lane], mode="drop")
 
@@ -95,4 +95,4 @@ def with_costs(world: Space, tree: Tree[Payload]) -> Tree[Payload]:
 
 def _edge_is_free(world: Space, q_from: jax.Array, q_to: jax.Array, steps: int) -> jax.Array:
     edge = world.edge(q_from, q_to)
-    return world.checkable(edge, steps) & (free_along(world, q_from, edge, steps) == steps)
+    return world.is_resolved(edge, steps) & (free_prefix(world, q_from, edge, steps) == steps)

@@ -21,7 +21,7 @@ from vrrt_jax.core.types import ExpansionPolicy, Tree, pytree
 CHUNK = 8  # iterations between two looks at the clock
 
 
-class Stopped(enum.IntEnum):
+class StopReason(enum.IntEnum):
     """Why a search ended."""
 
     REACHED = 0  # a node's score is at or below the goal score
@@ -33,7 +33,7 @@ class Stopped(enum.IntEnum):
 
 
 @pytree
-class Stop:
+class Termination:
     """When to stop, as traced numbers."""
 
     score: jax.Array  # () goal score
@@ -58,14 +58,14 @@ class SearchResult:
     """A finished search."""
 
     tree: Tree
-    stopped: Stopped  # of a batch, the last of them in the order above
+    stopped: StopReason  # of a batch, the last of them in the order above
     history: np.ndarray  # (chunks + 1, 4): iteration, seconds, best score, nodes
     compile_s: float
     search_s: float
-    stopped_each: tuple[Stopped, ...] = ()  # of the problems of a batch
+    stopped_each: tuple[StopReason, ...] = ()  # of the problems of a batch
 
 
-def make_stop(
+def make_termination(
     score: float,
     *,
     max_iterations: int,
@@ -73,9 +73,9 @@ def make_stop(
     patience: int | None = None,
     min_improvement: float = 0.0,
     min_ratio: float = 1.0,
-) -> Stop:
+) -> Termination:
     """A stopping rule; without ``patience`` the search never counts as converged."""
-    return Stop(
+    return Termination(
         score=jnp.float32(score),
         settle=jnp.int32(settle),
         max_iterations=jnp.int32(max_iterations),
@@ -92,15 +92,15 @@ def initial_state(tree: Tree) -> SearchState:
     )
 
 
-def why_stopped(state: SearchState, stop: Stop) -> jax.Array:
-    """The :class:`Stopped` code () that holds, -1 while the search should go on."""
+def stop_reason(state: SearchState, stop: Termination) -> jax.Array:
+    """The :class:`StopReason` code () that holds, -1 while the search should go on."""
     tree = state.tree
     idle = tree.iteration - state.reference_iteration
     reasons = (
-        (Stopped.REACHED, (jnp.min(tree.score) <= stop.score) & (idle >= stop.settle)),
-        (Stopped.CONVERGED, idle >= stop.patience),
-        (Stopped.ITERATIONS, tree.iteration >= stop.max_iterations),
-        (Stopped.TREE_FULL, tree.size >= tree.capacity),
+        (StopReason.REACHED, (jnp.min(tree.score) <= stop.score) & (idle >= stop.settle)),
+        (StopReason.CONVERGED, idle >= stop.patience),
+        (StopReason.ITERATIONS, tree.iteration >= stop.max_iterations),
+        (StopReason.TREE_FULL, tree.size >= tree.capacity),
     )
     code = jnp.int32(-1)
     for reason, holds in reversed(reasons):
@@ -112,15 +112,15 @@ def run_chunk(
     world: Space,
     policy: ExpansionPolicy,
     state: SearchState,
-    stop: Stop,
+    stop: Termination,
     key: jax.Array,
     num_iterations: jax.Array,
 ) -> tuple[SearchState, jax.Array]:
-    """Up to ``num_iterations`` iterations, and the rule that holds then: :func:`why_stopped`."""
+    """Up to ``num_iterations`` iterations, and the rule that holds then: :func:`stop_reason`."""
     last = state.tree.iteration + num_iterations
 
     def goes_on(state: SearchState) -> jax.Array:
-        return (state.tree.iteration < last) & (why_stopped(state, stop) < 0)
+        return (state.tree.iteration < last) & (stop_reason(state, stop) < 0)
 
     def iterate(state: SearchState) -> SearchState:
         tree = expand(world, policy, state.tree, key)
@@ -134,7 +134,7 @@ def run_chunk(
         )
 
     state = jax.lax.while_loop(goes_on, iterate, state)
-    return state, why_stopped(state, stop)
+    return state, stop_reason(state, stop)
 
 
 _chunk = jax.jit(run_chunk)
@@ -147,7 +147,7 @@ def search(
     tree: Tree,
     *,
     key: jax.Array,
-    stop: Stop,
+    stop: Termination,
     time_limit_s: float = float("inf"),
     batched: bool = False,
     on_progress: Callable[[SearchState, float], Any] | None = None,
@@ -181,12 +181,12 @@ def search(
                 on_progress(state, seconds)
             codes = np.atleast_1d(codes)
             if interrupted.is_set():
-                codes = np.where(codes != Stopped.REACHED, Stopped.INTERRUPTED, codes)
+                codes = np.where(codes != StopReason.REACHED, StopReason.INTERRUPTED, codes)
             elif seconds >= time_limit_s:
-                codes = np.where(codes < 0, Stopped.TIME_LIMIT, codes)
+                codes = np.where(codes < 0, StopReason.TIME_LIMIT, codes)
             if np.min(codes) >= 0:
                 break
-    each = tuple(Stopped(code) for code in codes.tolist())
+    each = tuple(StopReason(code) for code in codes.tolist())
     return SearchResult(
         tree=state.tree,
         stopped=max(each),

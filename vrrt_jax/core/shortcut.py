@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.edges import Edge, Space, distance, free_along
+from vrrt_jax.core.edges import Edge, Space, distance, free_prefix
 from vrrt_jax.core.types import pytree
 
 LANES = 32
@@ -67,17 +67,17 @@ def _round(world: Space, path: _Path, key: jax.Array) -> _Path:
     ends = jnp.sort(ends.at[0].set(jnp.stack([0.0 * along[-1], along[-1]])), axis=1)
     index = jnp.clip(jnp.searchsorted(along, ends, side="right") - 1, 0, path.size - 2)
     share = jnp.clip((ends - along[index]) / jnp.maximum(length[index], 1e-9), 0.0, 1.0)
-    parts = world.part(_rows(edges, index), share)
+    parts = world.truncate(_rows(edges, index), share)
     q_ends, at = world.end(path.q[index], parts), along[index] + world.length(parts)
     q_a, q_b = q_ends[:, 0], q_ends[:, 1]
 
     direct = world.edge(q_a, q_b)
     saving = at[:, 1] - at[:, 0] - world.length(direct)
-    tried = (saving > GAIN) & world.checkable(direct, EDGE_STEPS)
-    direct = world.part(direct, tried.astype(q_a.dtype))
-    coarse = free_along(world, q_a, direct, COARSE_STEPS) == COARSE_STEPS
+    tried = (saving > GAIN) & world.is_resolved(direct, EDGE_STEPS)
+    direct = world.truncate(direct, tried.astype(q_a.dtype))
+    coarse = free_prefix(world, q_a, direct, COARSE_STEPS) == COARSE_STEPS
     saving, lane = jax.lax.top_k(jnp.where(tried & coarse, saving, 0.0), CHECKED)
-    free = free_along(world, q_a[lane], _rows(direct, lane), EDGE_STEPS) == EDGE_STEPS
+    free = free_prefix(world, q_a[lane], _rows(direct, lane), EDGE_STEPS) == EDGE_STEPS
     saving = jnp.where(free, saving, 0.0)
 
     most = jnp.argmax(saving)
@@ -88,8 +88,8 @@ def _round(world: Space, path: _Path, key: jax.Array) -> _Path:
     place = jnp.arange(path.q.shape[0])
     source = jnp.where(place <= first, place, place - (first + 3) + last + 1)
     spliced = path.q[jnp.clip(source, 0, path.q.shape[0] - 1)]
-    spliced = jnp.where((place == first + 1)[:, None], world.normalise(q_a[best]), spliced)
-    spliced = jnp.where((place == first + 2)[:, None], world.normalise(q_b[best]), spliced)
+    spliced = jnp.where((place == first + 1)[:, None], world.normalize(q_a[best]), spliced)
+    spliced = jnp.where((place == first + 2)[:, None], world.normalize(q_b[best]), spliced)
     return _Path(
         q=jnp.where(found, spliced, path.q),
         size=jnp.where(found, size, path.size),

@@ -1,4 +1,4 @@
-"""The tree: allocation, insertion, nearest neighbours and the way back to the root."""
+"""The tree: allocation, insertion, nearest neighbors and the way back to the root."""
 
 import dataclasses
 from typing import TypeVar

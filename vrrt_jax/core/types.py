@@ -28,7 +28,7 @@ def static(**kwargs: Any) -> Any:
     return dataclasses.field(metadata={"static": True}, **kwargs)
 
 
-class Labels(tuple):
+class TraceIgnoredNames(tuple):
     """Names carried by a pytree for messages and look-ups on the host.
 
     Any two compare equal, so that renaming an obstacle never re-traces a function.
@@ -38,7 +38,7 @@ class Labels(tuple):
 
     def __eq__(self, other: object) -> bool:
         """Equal to any other labels."""
-        return isinstance(other, Labels)
+        return isinstance(other, TraceIgnoredNames)
 
     def __hash__(self) -> int:
         """One hash for all labels."""

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
-STEP = 1e-4  # [m] centres and radii of fitted spheres are multiples of this
+STEP = 1e-4  # [m] centers and radii of fitted spheres are multiples of this
 _MANY_FACES = 400  # hulls with more are simplified, outwards
 _BLOCK = 10_000_000  # numbers in memory at once
 _ROUND = 20  # sides of the prism around a cylinder, 1.2 % wider; 2.5 % for other round shapes
@@ -156,7 +156,7 @@ def union_depth(pieces: list[Piece], points: np.ndarray) -> np.ndarray:
 
 
 def contain_surface(
-    pieces: list[Piece], centres: np.ndarray, radii: np.ndarray, *, leaf: float
+    pieces: list[Piece], centers: np.ndarray, radii: np.ndarray, *, leaf: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Round spheres to steps of ``STEP`` and grow them until they provably contain a surface.
 
@@ -165,20 +165,20 @@ def contain_surface(
 
     Args:
         pieces: of one body.
-        centres: (n, 3) [m].
+        centers: (n, 3) [m].
         radii: (n,) [m].
         leaf: size below which triangles are not split any further [m]; where two spheres meet,
             they grow by up to half of it.
 
     Returns:
-        Centres (n, 3) and radii (n,) [m].
+        Centers (n, 3) and radii (n,) [m].
     """
-    centres = np.round(centres / STEP) * STEP
+    centers = np.round(centers / STEP) * STEP
     for piece in pieces:
         triangles = piece.vertices[piece.triangles]
         others = [other for other in pieces if other is not piece]
         while len(triangles):
-            corner_distance = np.linalg.norm(triangles[:, :, None] - centres, axis=-1)
+            corner_distance = np.linalg.norm(triangles[:, :, None] - centers, axis=-1)
             if not others:  # all corners are surface: gaps close here, before they are split
                 radii = grow(corner_distance.reshape(-1, len(radii)), radii)
             distance = corner_distance.max(1)
@@ -191,14 +191,14 @@ def contain_surface(
             is_leaf = edges.max(1, initial=0) < leaf
             radii = grow(distance[is_leaf], radii)
             triangles = _split(triangles[~is_leaf])
-    return centres, np.ceil(radii / STEP - 1e-9) * STEP
+    return centers, np.ceil(radii / STEP - 1e-9) * STEP
 
 
 def grow(distance: np.ndarray, radii: np.ndarray) -> np.ndarray:
     """Enlarge radii, each time as little as possible, until every point is in a sphere.
 
     Args:
-        distance: (p, n) from points to centres [m].
+        distance: (p, n) from points to centers [m].
         radii: (n,) [m].
 
     Returns:

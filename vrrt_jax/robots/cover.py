@@ -1,6 +1,6 @@
 """Cover a body with few spheres that stick out little where obstacles could be.
 
-The spheres of a body minimise the volume of false alarms: places for the centre of a ball-shaped
+The spheres of a body minimize the volume of false alarms: places for the center of a ball-shaped
 obstacle that touches a sphere but not the robot. They are found by gradient descent from several
 starts, with a penalty on surface left uncovered, and grown at last until nothing is.
 """
@@ -31,7 +31,7 @@ class BodySamples:
     """Points around a body, in its frame."""
 
     inside: np.ndarray  # (p, 3) surface and interior, to be covered [m]
-    outside: np.ndarray  # (x, 3) centres of balls that do not touch the robot [m]
+    outside: np.ndarray  # (x, 3) centers of balls that do not touch the robot [m]
     ball: np.ndarray  # (x,) their radii [m]
     cell: float  # volume that each outside point stands for [m^3]
 
@@ -128,55 +128,55 @@ def fit_body(
         rng: source of randomness.
 
     Returns:
-        Centres (num, 3) and radii (num,) [m], and the volume of false alarms [m^3].
+        Centers (num, 3) and radii (num,) [m], and the volume of false alarms [m^3].
     """
     starts = [_start(samples.inside, num, rng) for _ in range(_STARTS)]
-    centres = np.zeros((_STARTS, MAX_SPHERES, 3))
+    centers = np.zeros((_STARTS, MAX_SPHERES, 3))
     radii = np.full((_STARTS, MAX_SPHERES), -1.0)  # unused: far from everything
-    for k, (centre, radius) in enumerate(starts):
-        centres[k, :num], radii[k, :num] = centre, radius
+    for k, (center, radius) in enumerate(starts):
+        centers[k, :num], radii[k, :num] = center, radius
     arrays = (samples.outside, samples.ball, samples.inside)
-    fitted = _descend(centres, radii, num, *(jnp.asarray(a, jnp.float32) for a in arrays))
+    fitted = _descend(centers, radii, num, *(jnp.asarray(a, jnp.float32) for a in arrays))
     best = (np.inf, np.zeros((num, 3)), np.zeros(num))
-    for centre, radius in zip(*(np.asarray(a, np.float64)[:, :num] for a in fitted), strict=True):
-        inside = np.linalg.norm(samples.inside[:, None] - centre, axis=-1)
+    for center, radius in zip(*(np.asarray(a, np.float64)[:, :num] for a in fitted), strict=True):
+        inside = np.linalg.norm(samples.inside[:, None] - center, axis=-1)
         radius = grow(inside, radius)
-        gap = np.linalg.norm(samples.outside[:, None] - centre, axis=-1) - radius
+        gap = np.linalg.norm(samples.outside[:, None] - center, axis=-1) - radius
         volume = float(np.sum(gap.min(1) < samples.ball) * samples.cell)
-        best = min(best, (volume, centre, radius), key=lambda found: found[0])
+        best = min(best, (volume, center, radius), key=lambda found: found[0])
     return best[1], best[2], best[0]
 
 
 def _start(points: np.ndarray, num: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Spheres around the clusters that k-means finds."""
     points = points[rng.choice(len(points), 800)]
-    centres = points[rng.choice(len(points), num, replace=False)]
+    centers = points[rng.choice(len(points), num, replace=False)]
     for _ in range(15):
-        nearest = np.linalg.norm(points[:, None] - centres, axis=-1).argmin(1)
+        nearest = np.linalg.norm(points[:, None] - centers, axis=-1).argmin(1)
         for k in np.unique(nearest):
-            centres[k] = points[nearest == k].mean(0)
-    distance = np.linalg.norm(points[:, None] - centres, axis=-1)
+            centers[k] = points[nearest == k].mean(0)
+    distance = np.linalg.norm(points[:, None] - centers, axis=-1)
     nearest = distance.argmin(1)
     radii = [distance[nearest == k, k].max(initial=0.02) for k in range(num)]
-    return centres, np.array(radii)
+    return centers, np.array(radii)
 
 
 @jax.jit
 def _descend(
-    centres: jax.Array,
+    centers: jax.Array,
     radii: jax.Array,
     num: jax.Array,
     outside: jax.Array,
     ball: jax.Array,
     inside: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Improve (starts, spheres, 3) centres and (starts, spheres) radii by Adam."""
+    """Improve (starts, spheres, 3) centers and (starts, spheres) radii by Adam."""
     used = jnp.arange(MAX_SPHERES) < num
     optimizer = optax.adam(optax.cosine_decay_schedule(2e-3, _STEPS, 0.02))
 
     def distance(spheres, points):
-        centre, radius = spheres
-        gap = jnp.linalg.norm(points[:, None] - centre, axis=-1) - radius
+        center, radius = spheres
+        gap = jnp.linalg.norm(points[:, None] - center, axis=-1) - radius
         return jnp.min(jnp.where(used, gap, jnp.inf), axis=-1)
 
     def loss(spheres, progress):
@@ -190,9 +190,9 @@ def _descend(
         updates, state = optimizer.update(jax.grad(loss)(spheres, progress), state)
         return (jax.tree.map(jnp.add, spheres, updates), state), None
 
-    def descend(centre, radius):
-        carry = ((centre, radius), optimizer.init((centre, radius)))
+    def descend(center, radius):
+        carry = ((center, radius), optimizer.init((center, radius)))
         (spheres, _), _ = jax.lax.scan(step, carry, jnp.arange(_STEPS) / _STEPS)
         return spheres
 
-    return jax.vmap(descend)(jnp.asarray(centres), jnp.asarray(radii))
+    return jax.vmap(descend)(jnp.asarray(centers), jnp.asarray(radii))

@@ -26,7 +26,7 @@ def fit_spheres(
     """Fit spheres anew; takes some minutes.
 
     Cover spheres contain every point of the surface of the moving bodies, so that no contact with
-    an obstacle is missed. Thin spheres have centres of these and some in the base, and radii that
+    an obstacle is missed. Thin spheres have centers of these and some in the base, and radii that
     agree best with the true geometry in self-collision.
 
     Args:
@@ -84,7 +84,7 @@ def _comment(name: str, num_spheres: int, num_base_spheres: int, seed: int) -> s
   Written by the command `vrrt spheres` for {name}: {num_spheres} moving spheres,
   {num_base_spheres} on the base, seed {seed}.
   cover: contain the convex collision meshes of the moving bodies; checked against obstacles.
-  thin: some of the same centres; radii agree best with the meshes in self-collision.
+  thin: some of the same centers; radii agree best with the meshes in self-collision.
   exclude: bodies that share a joint, and bodies whose meshes touch in none of
   {_CONFIGURATIONS:,} random configurations.
 """
@@ -93,7 +93,7 @@ def _comment(name: str, num_spheres: int, num_base_spheres: int, seed: int) -> s
 def _collect(spheres: dict[int, tuple[np.ndarray, np.ndarray]]) -> mjcf_writer.BodySpheres:
     return mjcf_writer.BodySpheres(
         body=np.repeat(list(spheres), [len(radii) for _, radii in spheres.values()]),
-        centre=np.vstack([centres for centres, _ in spheres.values()]),
+        center=np.vstack([centers for centers, _ in spheres.values()]),
         radius=np.hstack([radii for _, radii in spheres.values()]),
     )
 

@@ -39,7 +39,7 @@ class Spheres:
     """Collision spheres bound to links."""
 
     link: jax.Array  # (n,) i32
-    centre: jax.Array  # (n, 3) in the link's frame [m]
+    center: jax.Array  # (n, 3) in the link's frame [m]
     radius: jax.Array  # (n,) [m]
 
 

@@ -21,7 +21,7 @@ class BodySpheres:
     """Spheres bound to bodies of a model."""
 
     body: np.ndarray  # (n,) int
-    centre: np.ndarray  # (n, 3) in the frame of the body [m]
+    center: np.ndarray  # (n, 3) in the frame of the body [m]
     radius: np.ndarray  # (n,) [m]
 
 
@@ -67,7 +67,7 @@ def collision_mjcf(
             elements[body] = _add_body(parent, model, body)
         for label, spheres in (("cover", cover), ("thin", thin)):
             for k in np.flatnonzero(spheres.body == body):
-                where = {"pos": _numbers(spheres.centre[k]), "size": _numbers(spheres.radius[k])}
+                where = {"pos": _numbers(spheres.center[k]), "size": _numbers(spheres.radius[k])}
                 ET.SubElement(elements[body], "geom", {"class": label} | where)
     custom = ET.SubElement(root, "custom")
     if mesh_source is not None:

@@ -31,12 +31,12 @@ class Robot:
     link_names: tuple[str, ...]  # (L,) body of each link that its joint moves
     lower: np.ndarray  # (D,) [rad] or [m]; -pi for an unlimited hinge
     upper: np.ndarray  # (D,) [rad] or [m]; pi for an unlimited hinge
-    wraps: np.ndarray  # (D,) bool, an unlimited hinge: q and q + 2 pi are the same
+    is_continuous: np.ndarray  # (D,) bool, an unlimited hinge: q and q + 2 pi are the same
     home: np.ndarray  # (D,) a free configuration [rad] or [m]
     cover: Spheres  # cover the moving links: checked against obstacles
-    cover_bodies: tuple[str, ...]  # body of each sphere of ``cover``, for messages
+    collision_sphere_bodies: tuple[str, ...]  # body of each sphere of ``cover``, for messages
     thin: Spheres  # follow the surface of all links, the base too: checked against each other
-    thin_bodies: tuple[str, ...]  # body of each sphere of ``thin``, for messages
+    self_collision_sphere_bodies: tuple[str, ...]  # body of each sphere of ``thin``, for messages
     pairs: np.ndarray  # (P, 2) i32 indices into ``thin``: which are checked against each other
     allowed: tuple[tuple[str, str], ...]  # pairs of bodies that are never checked
     frozen: Mapping[str, float]  # joints of the true geometry that are fixed [rad] or [m]
@@ -105,14 +105,14 @@ def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None =
 
 
 def workspace(robot: Robot) -> tuple[np.ndarray, float]:
-    """Centre (3,) and radius [m] of what the robot fills in random configurations."""
+    """Center (3,) and radius [m] of what the robot fills in random configurations."""
     rng = np.random.default_rng(0)
     q = rng.uniform(robot.lower, robot.upper, (500, robot.num_joints))
     poses = np.asarray(batch_link_poses(robot.chain, jnp.asarray(q, jnp.float32)), np.float64)
     points = []
-    for spheres_of_kind in (robot.cover, robot.thin):
+    for spheres_of_kind in (robot.collision_spheres, robot.self_collision_spheres):
         pose = poses[:, np.asarray(spheres_of_kind.link)]
-        turned = np.einsum("nkij,kj->nki", pose[..., :3, :3], spheres_of_kind.centre)
+        turned = np.einsum("nkij,kj->nki", pose[..., :3, :3], spheres_of_kind.center)
         points.append(turned + pose[..., :3, 3])
     low, high = np.quantile(np.concatenate(points, axis=1).reshape(-1, 3), [0.01, 0.99], axis=0)
     return (low + high) / 2, float(np.linalg.norm(high - low) / 2)
@@ -141,10 +141,10 @@ def _robot(*, model: mujoco.MjModel, **fields) -> Robot:
     for label, group in (("cover", mjcf_writer.COVER), ("thin", mjcf_writer.THIN)):
         geoms = np.flatnonzero(model.geom_group == int(group["group"]))
         bodies = model.geom_bodyid[geoms]
-        centre = np.einsum("nij,nj->ni", body_in_link[bodies, :3, :3], model.geom_pos[geoms])
+        center = np.einsum("nij,nj->ni", body_in_link[bodies, :3, :3], model.geom_pos[geoms])
         labels[label] = Spheres(
             link=jnp.asarray(body_link[bodies], jnp.int32),
-            centre=jnp.asarray(centre + body_in_link[bodies, :3, 3], jnp.float32),
+            center=jnp.asarray(center + body_in_link[bodies, :3, 3], jnp.float32),
             radius=jnp.asarray(model.geom_size[geoms, 0], jnp.float32),
         )
         labels[f"{label}_bodies"] = tuple(model.body(body).name for body in bodies)
@@ -156,7 +156,7 @@ def _robot(*, model: mujoco.MjModel, **fields) -> Robot:
         link_names=tuple(model.body(body).name for body in link_bodies),
         lower=lower,
         upper=upper,
-        wraps=model.jnt_limited == 0,
+        is_continuous=model.jnt_limited == 0,
         home=model.key_qpos[0].copy(),
         pairs=pairs.checked_pairs(model),
         **labels,

@@ -76,14 +76,14 @@ def _is_kind(model: mujoco.MjModel, geoms: np.ndarray, kind: dict[str, str]) -> 
 def _select(model: mujoco.MjModel, geoms: np.ndarray) -> mjcf_writer.BodySpheres:
     return mjcf_writer.BodySpheres(
         body=model.geom_bodyid[geoms],
-        centre=model.geom_pos[geoms],
+        center=model.geom_pos[geoms],
         radius=model.geom_size[geoms, 0],
     )
 
 
 def _fitted(model: mujoco.MjModel) -> RobotSpheres:
     rng = np.random.default_rng(0)
-    body, centre, radius = [], [], []
+    body, center, radius = [], [], []
     bodies = collision_pieces(model)
     extents = {
         index: np.ptp(np.vstack([piece.vertices for piece in pieces]), axis=0).max()
@@ -93,17 +93,17 @@ def _fitted(model: mujoco.MjModel) -> RobotSpheres:
         # fine for small bodies, but without spending most spheres on the smallest
         own_bulge = max(extents[index], max(extents.values()) / 2) * _RELATIVE_BULGE
         own_bulge = min(own_bulge, _BULGE)
-        centres, radii = cover_body(pieces, own_bulge, rng)
+        centers, radii = cover_body(pieces, own_bulge, rng)
         body.append(np.full(len(radii), index))
-        centre.append(centres)
+        center.append(centers)
         radius.append(radii)
-    owners, centres, radii = np.hstack(body), np.vstack(centre), np.hstack(radius)
+    owners, centers, radii = np.hstack(body), np.vstack(center), np.hstack(radius)
     moves = model.body_weldid[owners] != 0
     return RobotSpheres(
         cover=mjcf_writer.BodySpheres(
-            body=owners[moves], centre=centres[moves], radius=radii[moves]
+            body=owners[moves], center=centers[moves], radius=radii[moves]
         ),
-        thin=mjcf_writer.BodySpheres(body=owners, centre=centres, radius=radii),
+        thin=mjcf_writer.BodySpheres(body=owners, center=centers, radius=radii),
         origin="fitted",
     )
 
@@ -119,14 +119,14 @@ def cover_body(
         rng: source of randomness.
 
     Returns:
-        Centres (n, 3) and radii (n,) [m].
+        Centers (n, 3) and radii (n,) [m].
     """
     surface = surface_samples(pieces, _SPACING, rng)
     if len(surface) > _NUM_SURFACE:
         surface = surface[rng.choice(len(surface), _NUM_SURFACE, replace=False)]
-    centres = np.vstack([_inner_points(piece, rng) for piece in pieces])
-    radii = union_depth(pieces, centres) + bulge
-    covers = np.linalg.norm(surface[:, None] - centres, axis=-1) <= radii
+    centers = np.vstack([_inner_points(piece, rng) for piece in pieces])
+    radii = union_depth(pieces, centers) + bulge
+    covers = np.linalg.norm(surface[:, None] - centers, axis=-1) <= radii
     chosen = []
     while len(covers):
         best = int(np.argmax(covers.sum(0)))
@@ -134,11 +134,11 @@ def cover_body(
             break
         chosen.append(best)
         covers = covers[~covers[:, best]]
-    return contain_surface(pieces, centres[chosen], radii[chosen], leaf=_LEAF)
+    return contain_surface(pieces, centers[chosen], radii[chosen], leaf=_LEAF)
 
 
 def _inner_points(piece: Piece, rng: np.random.Generator) -> np.ndarray:
-    """Points (n, 3) where spheres may be centred, most of them far from the surface."""
+    """Points (n, 3) where spheres may be centered, most of them far from the surface."""
     corners = piece.vertices[np.unique(piece.triangles)]
     points = rng.dirichlet(np.full(len(corners), 0.3), _NUM_CENTRES) @ corners
     spread = np.ptp(corners, axis=0).max() / 10

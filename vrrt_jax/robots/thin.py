@@ -46,7 +46,7 @@ def refine(
     radii, is_used = _fit_radii(draft, found.q, truth)
     return mjcf_writer.BodySpheres(
         body=spheres.body[is_used],
-        centre=spheres.centre[is_used],
+        center=spheres.center[is_used],
         radius=np.round(radii[is_used] / STEP) * STEP,
     )
 
@@ -77,8 +77,8 @@ def _fit_radii(
     for q, is_colliding in zip(configurations, truth, strict=True):
         data.qpos[:] = q
         mujoco.mj_kinematics(draft, data)
-        centres = data.geom_xpos[geoms]
-        apart = np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1)
+        centers = data.geom_xpos[geoms]
+        apart = np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1)
         if is_colliding or np.max(reach - apart) > -_NEAR:
             first = np.argpartition(apart - reach, nearest - 1)[:nearest]
             rows.append(apart[first].astype(np.float32))

@@ -26,7 +26,7 @@ _OTHER_VERSION = "install the version of the meshes that the README names"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class ExactModel:
+class ExactScene:
     """A robot and obstacles in C MuJoCo."""
 
     model: mujoco.MjModel
@@ -72,9 +72,9 @@ class ExactModel:
         return f"{first} touches {second.removeprefix('obstacle: ')}"
 
 
-def exact_model(
+def exact_scene(
     robot: Robot, obstacles: Sequence[Obstacle], *, geometry: str = "auto"
-) -> ExactModel:
+) -> ExactScene:
     """A compiled model of robot and obstacles; the latest ones are kept.
 
     Args:
@@ -97,7 +97,7 @@ def exact_model(
 
 
 def _hashable(obstacle: Obstacle) -> Obstacle:
-    """The obstacle with tuples of floats, whatever it was made of, and without its colour."""
+    """The obstacle with tuples of floats, whatever it was made of, and without its color."""
     x, y, z = (float(value) for value in obstacle.position)
     qw, qx, qy, qz = (float(value) for value in obstacle.quaternion)
     a, b, c = (float(value) for value in obstacle.size)
@@ -111,7 +111,7 @@ def _hashable(obstacle: Obstacle) -> Obstacle:
 
 
 @functools.lru_cache(maxsize=8)
-def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> ExactModel:
+def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> ExactScene:
     spec = None if geometry == "spheres" else mesh_spec(robot, visuals=False)
     if spec is None and geometry == "meshes":
         raise ValueError(
@@ -123,7 +123,7 @@ def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> Exac
     spec = spec or spheres
     if has_meshes:
         _check_same_robot(robot, spec.copy().compile(), spheres.compile())
-        _exclude(spec, robot.allowed)
+        _exclude(spec, robot.ignored_pairs)
     num_bodies = len(spec.bodies)
     for obstacle in obstacles:
         # spheres of the robot see bit 0 only, so that its thin ones ignore obstacles
@@ -141,7 +141,7 @@ def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> Exac
     if not has_meshes:
         sees_obstacles = model.geom_group == int(mjcf_writer.COVER["group"])
     is_moving = model.body_weldid[model.geom_bodyid] != 0
-    return ExactModel(
+    return ExactScene(
         model=model,
         data=mujoco.MjData(model),
         geometry="meshes" if has_meshes else "spheres",
@@ -164,7 +164,10 @@ def _check_same_robot(robot: Robot, meshes: mujoco.MjModel, spheres: mujoco.MjMo
         data.qpos[:] = robot.home
         mujoco.mj_kinematics(model, data)
         frames.append({model.body(k).name: data.xpos[k] for k in range(1, model.nbody)})
-    missing = {*robot.cover_bodies, *robot.thin_bodies} - {"world", *frames[0]}
+    missing = {*robot.collision_sphere_bodies, *robot.self_collision_sphere_bodies} - {
+        "world",
+        *frames[0],
+    }
     if missing:
         raise ValueError(
             f"the meshes of robot '{robot.name}' have no body {', '.join(sorted(missing))}; have: "

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.exact import ExactModel, exact_model
+from vrrt_jax.scene.exact import ExactScene, exact_scene
 from vrrt_jax.scene.obstacles import Obstacle
 
 _SCENES = 20
@@ -64,8 +64,8 @@ def measure_spheres(robot: Robot, num: int = 10_000, seed: int = 0) -> SphereRep
     missed: dict[tuple[str, str], int] = {}
     for scene in np.array_split(np.arange(num), _SCENES):
         obstacles = _random_obstacles(rng, reach)
-        truth = exact_model(robot, obstacles, geometry="meshes")
-        spheres = exact_model(robot, obstacles, geometry="spheres")
+        truth = exact_scene(robot, obstacles, geometry="meshes")
+        spheres = exact_scene(robot, obstacles, geometry="spheres")
         for q in rng.uniform(robot.lower, robot.upper, (len(scene), robot.num_joints)):
             true_pairs, sphere_pairs = _by_kind(truth, q), _by_kind(spheres, q)
             rows.append([bool(pairs) for pairs in true_pairs + sphere_pairs])
@@ -91,7 +91,7 @@ def _agreement(truth: np.ndarray, spheres: np.ndarray) -> Agreement:
     )
 
 
-def _by_kind(exact: ExactModel, q: np.ndarray) -> list[list[tuple[int, int]]]:
+def _by_kind(exact: ExactScene, q: np.ndarray) -> list[list[tuple[int, int]]]:
     """Touching pairs of bodies at ``q`` (D,): with obstacles, and of the robot with itself."""
     pairs = exact.touching(q)
     return [
@@ -102,7 +102,7 @@ def _by_kind(exact: ExactModel, q: np.ndarray) -> list[list[tuple[int, int]]]:
 
 def _reach(robot: Robot) -> float:
     """How far the moving spheres get from the origin [m], in 200 random configurations."""
-    exact = exact_model(robot, [], geometry="spheres")
+    exact = exact_scene(robot, [], geometry="spheres")
     rng = np.random.default_rng(0)
     reach = 0.0
     for q in rng.uniform(robot.lower, robot.upper, (200, robot.num_joints)):

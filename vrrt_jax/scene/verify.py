@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.exact import exact_model
+from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.obstacles import Obstacle
 
 _LIMIT_TOLERANCE = 1e-5  # [rad] or [m], paths come in float32
@@ -38,7 +38,7 @@ def verify_path(
 ) -> Verification:
     """Check a path for limits, collision and self-collision.
 
-    The fixed base may touch anything; every other link may touch nothing but its neighbours. Pairs
+    The fixed base may touch anything; every other link may touch nothing but its neighbors. Pairs
     of links that never touch in thousands of random configurations, or nearly always, are left out.
 
     Args:
@@ -57,7 +57,7 @@ def verify_path(
     path = _checked_path(robot, path)
     if not step > 0:
         raise ValueError(f"step is {step}; expected a positive number [rad], such as 0.005")
-    exact = exact_model(robot, obstacles, geometry=geometry)
+    exact = exact_scene(robot, obstacles, geometry=geometry)
     configurations, fractions = _interpolate(robot, path, step)
     outside = _outside_limits(robot, configurations)
     first_outside = int(outside.any(1).argmax()) if outside.any() else len(configurations)
@@ -103,7 +103,7 @@ def contacts(
         ValueError: as :func:`verify_path`.
     """
     q = _checked_path(robot, np.asarray(q)[None])[0]
-    exact = exact_model(robot, obstacles, geometry=geometry)
+    exact = exact_scene(robot, obstacles, geometry=geometry)
     return [exact.describe(pair) for pair in exact.touching(q)]
 
 
@@ -124,19 +124,19 @@ def _interpolate(robot: Robot, path: np.ndarray, step: float) -> tuple[np.ndarra
     """Configurations (n, D) along the path, ends included, and their share (n,) of its length."""
     turns = np.diff(path, axis=0)
     # Half a turn, but for rounding, goes the way that is written.
-    around = robot.wraps & (np.abs(turns) > np.pi + _HALF_TURN_TOLERANCE)
+    around = robot.is_continuous & (np.abs(turns) > np.pi + _HALF_TURN_TOLERANCE)
     turns -= 2 * np.pi * np.round(turns / (2 * np.pi)) * around
     lengths = np.linalg.norm(turns, axis=1)
-    rows, travelled = [path[:1]], [np.zeros(1)]
+    rows, traveled = [path[:1]], [np.zeros(1)]
     for start, turn, before, length in zip(
         path, turns, np.cumsum(lengths) - lengths, lengths, strict=False
     ):
         count = max(int(np.ceil(length / step)), 1)
         part = np.arange(1, count + 1) / count
         rows.append(start + part[:, None] * turn)
-        travelled.append(before + part * length)
+        traveled.append(before + part * length)
     total = max(lengths.sum(), 1e-12)
-    return np.concatenate(rows), np.concatenate(travelled) / total
+    return np.concatenate(rows), np.concatenate(traveled) / total
 
 
 def _outside_limits(robot: Robot, configurations: np.ndarray) -> np.ndarray:
@@ -144,4 +144,4 @@ def _outside_limits(robot: Robot, configurations: np.ndarray) -> np.ndarray:
     outside = (configurations < robot.lower - _LIMIT_TOLERANCE) | (
         configurations > robot.upper + _LIMIT_TOLERANCE
     )
-    return outside & ~robot.wraps
+    return outside & ~robot.is_continuous

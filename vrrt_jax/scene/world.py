@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from vrrt_jax.core.edges import Straight
-from vrrt_jax.core.types import Labels, pytree, static
+from vrrt_jax.core.edges import StraightLineEdges
+from vrrt_jax.core.types import TraceIgnoredNames, pytree, static
 from vrrt_jax.robots.kinematics import Chain, Spheres, link_poses, place, placement
 from vrrt_jax.scene.obstacles import (
     HALF_SPACE,
@@ -28,24 +28,24 @@ from vrrt_jax.scene.obstacles import (
 
 
 @pytree
-class World(Straight):
+class World(StraightLineEdges):
     """All that planners ask about robot and obstacles."""
 
     chain: Chain
     cover: jax.Array  # (L * 12, 3 n) placement of the covering spheres, against obstacles
-    cover_radius: jax.Array  # (n,) [m]
+    collision_radius: jax.Array  # (n,) [m]
     thin: jax.Array  # (L * 12, 3 m) placement of the thinner spheres, against each other
     reach: jax.Array  # (m, m) distance at which two of them touch, 0 for pairs not checked [m]
     obstacles: Obstacles
     lower: jax.Array  # (D,)
     upper: jax.Array  # (D,)
-    wraps: jax.Array  # (D,) bool, joints that turn for ever
+    is_continuous: jax.Array  # (D,) bool, joints that turn for ever
     margin: jax.Array  # () clearance asked of obstacles [m]
     resolution: jax.Array  # () longest sub-step of an edge between two checks [rad]
-    joint_names: Labels = static()
-    obstacle_names: Labels = static()  # (K,) '' in empty slots
-    kinds: Labels = static()  # (K,)
-    colours: Labels = static()  # (K,)
+    joint_names: TraceIgnoredNames = static()
+    obstacle_names: TraceIgnoredNames = static()  # (K,) '' in empty slots
+    kinds: TraceIgnoredNames = static()  # (K,)
+    colors: TraceIgnoredNames = static()  # (K,)
 
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`is_free`."""
@@ -70,15 +70,17 @@ batch_is_free = jax.jit(jax.vmap(is_free, (None, 0)))  # of q (n, D), for the ho
 
 
 def _clearance(world: World, poses: jax.Array) -> jax.Array:
-    distances = signed_distances(world.obstacles, place(world.cover, poses))
-    return jnp.min(distances - world.cover_radius[:, None])
+    distances = signed_distances(world.obstacles, place(world.collision_spheres, poses))
+    return jnp.min(distances - world.collision_radius[:, None])
 
 
 def _self_gap(world: World, poses: jax.Array) -> jax.Array:
     """Smallest difference () of squared distance and squared reach [m^2]."""
-    centres = place(world.thin, poses)
-    apart = sum((axis[:, None] - axis[None]) ** 2 for axis in centres)
-    return jnp.min(apart - world.reach**2, initial=jnp.inf)  # few links have no pair to check
+    centers = place(world.self_collision_spheres, poses)
+    apart = sum((axis[:, None] - axis[None]) ** 2 for axis in centers)
+    return jnp.min(
+        apart - world.contact_distance**2, initial=jnp.inf
+    )  # few links have no pair to check
 
 
 def build_world(
@@ -107,27 +109,27 @@ def build_world(
             f"margin={margin} and resolution={resolution}: expected margin >= 0 m and "
             "resolution > 0 rad"
         )
-    reach = np.zeros((len(robot.thin.radius),) * 2, np.float32)
-    thin_radius = np.asarray(robot.thin.radius)
-    first, second = np.asarray(robot.pairs, int).reshape(-1, 2).T
+    reach = np.zeros((len(robot.self_collision_spheres.radius),) * 2, np.float32)
+    thin_radius = np.asarray(robot.self_collision_spheres.radius)
+    first, second = np.asarray(robot.self_collision_pairs, int).reshape(-1, 2).T
     reach[first, second] = thin_radius[first] + thin_radius[second]
     num_slots = 8 * max(-(-num_slots // 8), -(-len(obstacles) // 8), 1)
     world = World(
         chain=robot.chain,
-        cover=_placement(robot.cover, robot.chain),
-        cover_radius=robot.cover.radius,
-        thin=_placement(robot.thin, robot.chain),
+        cover=_placement(robot.collision_spheres, robot.chain),
+        collision_radius=robot.collision_spheres.radius,
+        thin=_placement(robot.self_collision_spheres, robot.chain),
         reach=jnp.asarray(reach),
         obstacles=to_slots([], num_slots),
         lower=jnp.asarray(robot.lower, jnp.float32),
         upper=jnp.asarray(robot.upper, jnp.float32),
-        wraps=jnp.asarray(robot.wraps, bool),
+        is_continuous=jnp.asarray(robot.is_continuous, bool),
         margin=jnp.float32(margin),
         resolution=jnp.float32(resolution),
-        joint_names=Labels(robot.joint_names),
-        obstacle_names=Labels([""] * num_slots),
-        kinds=Labels([""] * num_slots),
-        colours=Labels([()] * num_slots),
+        joint_names=TraceIgnoredNames(robot.joint_names),
+        obstacle_names=TraceIgnoredNames([""] * num_slots),
+        kinds=TraceIgnoredNames([""] * num_slots),
+        colors=TraceIgnoredNames([()] * num_slots),
     )
     return with_obstacles(world, obstacles)
 
@@ -153,15 +155,15 @@ def with_obstacles(world: World, obstacles: Sequence[Obstacle]) -> World:
     return dataclasses.replace(
         world,
         obstacles=to_slots(obstacles, num_slots),
-        obstacle_names=Labels(names + [""] * spare),
-        kinds=Labels([o.kind for o in obstacles] + [""] * spare),
-        colours=Labels([o.rgba for o in obstacles] + [()] * spare),
+        obstacle_names=TraceIgnoredNames(names + [""] * spare),
+        kinds=TraceIgnoredNames([o.kind for o in obstacles] + [""] * spare),
+        colors=TraceIgnoredNames([o.rgba for o in obstacles] + [()] * spare),
     )
 
 
 def with_margin(world: World, margin: float) -> World:
     """The same world, where the robot keeps ``margin`` [m] farther from obstacles and itself."""
-    reach = jnp.where(world.reach > 0, world.reach + margin, 0.0)
+    reach = jnp.where(world.contact_distance > 0, world.contact_distance + margin, 0.0)
     return dataclasses.replace(world, margin=world.margin + margin, reach=reach)
 
 
@@ -191,7 +193,7 @@ def obstacle_list(world: World) -> list[Obstacle]:
                 position=floats(position),
                 quaternion=floats(quaternion),
                 size=floats(size),
-                rgba=world.colours[k],
+                rgba=world.colors[k],
             )
         )
     return found
@@ -210,7 +212,7 @@ def move_obstacle(
     Args:
         world: robot and obstacles.
         name: of the obstacle.
-        position: (3,) of its centre in the world [m].
+        position: (3,) of its center in the world [m].
         quaternion: (4,) its turn in the world, w first.
         size: up to (3,) as MuJoCo's geom size: radius and half lengths [m].
 
@@ -230,5 +232,5 @@ def move_obstacle(
 
 
 def _placement(spheres: Spheres, chain: Chain) -> jax.Array:
-    matrix = placement(np.asarray(spheres.link), np.asarray(spheres.centre), chain.num_links)
+    matrix = placement(np.asarray(spheres.link), np.asarray(spheres.center), chain.num_links)
     return jnp.asarray(matrix)

@@ -22,7 +22,7 @@ def look_at(
     """Place a camera at ``eye`` that looks at ``target``.
 
     Args:
-        eye: camera centre in the world [m].
+        eye: camera center in the world [m].
         target: a point on the optical axis [m].
         fovy_deg: vertical field of view [degree].
         height: image height [px].
@@ -55,7 +55,7 @@ def camera_from_matrix(
     focal: float,
     height: int,
     width: int,
-    centre: Sequence[float] | None = None,
+    principal_point: Sequence[float] | None = None,
 ) -> Camera:
     """A calibrated camera.
 
@@ -64,7 +64,7 @@ def camera_from_matrix(
         focal: focal length [px].
         height: image height [px].
         width: image width [px].
-        centre: principal point x, y [px]; the middle of the image if None.
+        principal_point: x, y [px]; the middle of the image if None.
 
     Raises:
         ValueError: the matrix is not rigid, or a size is not positive.
@@ -78,11 +78,12 @@ def camera_from_matrix(
         )
     if not (focal > 0 and height > 0 and width > 0):
         raise ValueError(f"focal={focal}, height={height}, width={width}; all must be positive")
-    centre = (width / 2, height / 2) if centre is None else centre
+    if principal_point is None:
+        principal_point = (width / 2, height / 2)
     return Camera(
         world_to_cam=jnp.asarray(world_to_cam, jnp.float32),
         focal=jnp.float32(focal),
-        centre=jnp.asarray(centre, jnp.float32),
+        principal_point=jnp.asarray(principal_point, jnp.float32),
         height=int(height),
         width=int(width),
     )
@@ -126,7 +127,7 @@ def shrunk(camera: Camera, factor: int) -> Camera:
     return dataclasses.replace(
         camera,
         focal=camera.focal / factor,
-        centre=camera.centre / factor,
+        principal_point=camera.principal_point / factor,
         height=-(-camera.height // factor),
         width=-(-camera.width // factor),
     )
@@ -134,7 +135,9 @@ def shrunk(camera: Camera, factor: int) -> Camera:
 
 def cut(camera: Camera, corner: np.ndarray, height: int, width: int) -> Camera:
     """A part of the same view, whose upper left corner (..., 2) is at x, y [px]."""
-    return dataclasses.replace(camera, centre=camera.centre - corner, height=height, width=width)
+    return dataclasses.replace(
+        camera, principal_point=camera.principal_point - corner, height=height, width=width
+    )
 
 
 def stack_cameras(cameras: Sequence[Camera]) -> Camera:
@@ -151,4 +154,4 @@ def project(camera: Camera, points_world: jax.Array) -> tuple[jax.Array, jax.Arr
     points_cam = points_world @ camera.world_to_cam[:3, :3].T + camera.world_to_cam[:3, 3]
     depth = points_cam[..., 2]
     pixels = camera.focal * points_cam[..., :2] / jnp.maximum(depth, 0.01)[..., None]
-    return pixels + camera.centre, depth
+    return pixels + camera.principal_point, depth

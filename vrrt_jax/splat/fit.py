@@ -53,7 +53,7 @@ class FitConfig:
     image_px: int = 256
     fovy_deg: tuple[float, float] = (40.0, 55.0)
     elevation_deg: tuple[float, float] = (-75.0, 5.0)
-    # in radii of the robot's workspace, whose centre the cameras look at
+    # in radii of the robot's workspace, whose center the cameras look at
     distance: tuple[float, float] = (1.5, 2.6)
     target_spread: float = 0.15
     learning_rate: float = 0.1
@@ -167,14 +167,14 @@ def random_configurations(robot, num: int, rng: np.random.Generator) -> np.ndarr
 
 
 def random_camera(
-    config: FitConfig, centre: np.ndarray, radius: float, px: int, rng: np.random.Generator
+    config: FitConfig, center: np.ndarray, radius: float, px: int, rng: np.random.Generator
 ) -> Camera:
-    """A camera around a robot whose workspace has a centre (3,) and a radius [m]."""
+    """A camera around a robot whose workspace has a center (3,) and a radius [m]."""
     return orbit(
         azimuth_deg=rng.uniform(-180, 180),
         elevation_deg=rng.uniform(*config.elevation_deg),
         distance=radius * rng.uniform(*config.distance),
-        target=(centre + rng.normal(size=3) * radius * config.target_spread).tolist(),
+        target=(center + rng.normal(size=3) * radius * config.target_spread).tolist(),
         fovy_deg=rng.uniform(*config.fovy_deg),
         height=px,
         width=px,
@@ -207,7 +207,7 @@ def render_images(
     num_surfaces: int = 0,
     tip: tuple[int, np.ndarray] | None = None,
 ) -> tuple[Images, np.ndarray]:
-    """Render n images of random poses from random cameras; and surface points with colours.
+    """Render n images of random poses from random cameras; and surface points with colors.
 
     Args:
         robot: the robot.
@@ -219,15 +219,15 @@ def render_images(
         tip: a link and a point (3,) of it [m]: the images are close-ups of it.
 
     Returns:
-        The images; points (m, 7): link, position in the link's frame [m], colour.
+        The images; points (m, 7): link, position in the link's frame [m], color.
     """
     renderer = MeshRenderer(spec)
     body_link = body_links(renderer.model)
     rng = np.random.default_rng(seed)
     q = random_configurations(robot, num, rng)
-    centre, radius = workspace(robot)
+    center, radius = workspace(robot)
     px = config.image_px if tip is None else config.close_up_of_px
-    cameras = [random_camera(config, centre, radius, px, rng) for _ in range(num)]
+    cameras = [random_camera(config, center, radius, px, rng) for _ in range(num)]
     if tip is not None:
         off = rng.uniform(-config.close_up_off, config.close_up_off, (num, 2))
         cameras = [
@@ -254,8 +254,8 @@ def render_images(
 def _surface_points(robot, q, camera: Camera, depth, link, inside, rgb) -> np.ndarray:
     y, x = np.nonzero(inside)
     z = depth[y, x]
-    centre, focal = np.asarray(camera.centre), float(camera.focal)
-    in_cam = np.stack([(x + 0.5 - centre[0]) / focal * z, (y + 0.5 - centre[1]) / focal * z, z], 1)
+    center, focal = np.asarray(camera.principal_point), float(camera.focal)
+    in_cam = np.stack([(x + 0.5 - center[0]) / focal * z, (y + 0.5 - center[1]) / focal * z, z], 1)
     cam_to_world = np.linalg.inv(np.asarray(camera.world_to_cam, np.float64))
     world = in_cam @ cam_to_world[:3, :3].T + cam_to_world[:3, 3]
     poses = np.asarray(link_poses(robot.chain, jnp.asarray(q, jnp.float32)), np.float64)
@@ -291,7 +291,7 @@ def _write_images(file: Path, images: Images, points: np.ndarray) -> None:
             points=points,
             world_to_cam=np.asarray(images.cameras.world_to_cam),
             focal=np.asarray(images.cameras.focal),
-            centre=np.asarray(images.cameras.centre),
+            principal_point=np.asarray(images.cameras.principal_point),
         )
 
 
@@ -301,7 +301,7 @@ def _read_images(file: Path) -> tuple[Images, np.ndarray]:
         cameras = Camera(
             world_to_cam=jnp.asarray(saved["world_to_cam"]),
             focal=jnp.asarray(saved["focal"]),
-            centre=jnp.asarray(saved["centre"]),
+            principal_point=jnp.asarray(saved["principal_point"]),
             height=height,
             width=width,
         )
@@ -339,11 +339,11 @@ def initial_splats(points: np.ndarray, num_splats: int, seed: int) -> SplatModel
     for index, num in zip(links, quota, strict=True):
         own = points[points[:, 0] == index]
         own = own[rng.permutation(len(own))[: max(60 * num, 2000)]]
-        centre, label = kmeans2(own[:, 1:4], num, iter=8, minit="points", rng=rng)
-        apart = np.linalg.norm(own[:, 1:4] - centre[label], axis=1)
+        center, label = kmeans2(own[:, 1:4], num, iter=8, minit="points", rng=rng)
+        apart = np.linalg.norm(own[:, 1:4] - center[label], axis=1)
         for k in range(num):
             members = label == k
-            mean.append(centre[k])
+            mean.append(center[k])
             rgb.append(own[members, 4:].mean(0) if members.any() else own[:, 4:].mean(0))
             radius.append(np.sqrt((apart[members] ** 2).mean()) if members.sum() > 2 else 0.01)
         link += [index] * num
@@ -354,7 +354,7 @@ def initial_splats(points: np.ndarray, num_splats: int, seed: int) -> SplatModel
         radius=jnp.asarray(radius, jnp.float32),
         density=jnp.full(num_splats, 3.0, jnp.float32),
         rgb=jnp.asarray(rgb, jnp.float32),
-        shade=jnp.zeros((num_splats, 3)),
+        view_color_gradient=jnp.zeros((num_splats, 3)),
         link=jnp.asarray(link, jnp.int32),
         tau=jnp.float32(0.04),
     )
@@ -368,7 +368,7 @@ def _assemble(start: SplatModel, change: dict[str, jax.Array]) -> SplatModel:
         radius=start.radius * jnp.exp(0.5 * change["radius"]),
         density=start.density * jnp.exp(change["density"]),
         rgb=start.rgb + 0.5 * change["rgb"],
-        shade=start.shade + 0.5 * change["shade"],
+        view_color_gradient=start.view_color_gradient + 0.5 * change["view_color_gradient"],
         tau=0.03 + (start.tau - 0.03) * jnp.exp(change["tau"]),
     )
 
@@ -389,11 +389,11 @@ def _fit_level(
     start = initial_splats(points, level.num_splats, seed)
     change = {
         name: jnp.zeros_like(getattr(start, name))
-        for name in ("mean", "radius", "density", "rgb", "shade", "tau")
+        for name in ("mean", "radius", "density", "rgb", "view_color_gradient", "tau")
     }
     schedule = optax.cosine_decay_schedule(config.learning_rate, level.steps, 0.02)
-    optimiser = optax.adam(schedule, b1=0.9, b2=0.99)
-    state = optimiser.init(change)
+    optimizer = optax.adam(schedule, b1=0.9, b2=0.99)
+    state = optimizer.init(change)
 
     def loss(change, q, camera, rgb, coverage):
         image = render(_assemble(start, change), link_poses(robot.chain, q), camera)
@@ -408,7 +408,7 @@ def _fit_level(
         zero = (jnp.float32(0), jax.tree.map(jnp.zeros_like, change))
         (value, gradient), _ = jax.lax.scan(add, zero, batch)
         gradient = jax.tree.map(lambda g: g / level.batch, gradient)
-        updates, state = optimiser.update(gradient, state)
+        updates, state = optimizer.update(gradient, state)
         return optax.apply_updates(change, updates), state, value / level.batch
 
     rng = np.random.default_rng(seed)
@@ -441,7 +441,7 @@ def _fit_level(
         splats=splats,
         size_px=level.size_px,
         psnr_db=round(psnr_db(float(losses.mean())), 2),
-        match_bar=float(f"{np.quantile(losses / covered, 0.95):.4g}"),
+        match_threshold=float(f"{np.quantile(losses / covered, 0.95):.4g}"),
     )
 
 

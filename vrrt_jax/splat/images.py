@@ -11,7 +11,7 @@ from PIL import Image, UnidentifiedImageError
 from vrrt_jax.splat.camera import cut, shrunk, stack_cameras
 from vrrt_jax.splat.types import Camera, GoalImage
 
-BACKGROUND_TOLERANCE = 0.06  # colour difference that still counts as background
+BACKGROUND_TOLERANCE = 0.06  # color difference that still counts as background
 OPAQUE = 0.99  # a fourth channel that is nowhere less is no mask
 MOST = 0.9  # of an image on a plain background can be robot
 KNOWN = 0.75  # share of a shrunk pixel that has to be valid, for its mean to stand for all of it
@@ -59,7 +59,7 @@ def prepare_goal(
     Args:
         images: V arrays (H, W, 3) or (H, W, 4), uint8 or float in [0, 1]. The fourth channel is the
             robot's coverage; without it, or where all of it is opaque, whatever differs from the
-            colour that prevails on the border is taken to be robot.
+            color that prevails on the border is taken to be robot.
         cameras: V cameras of the images' sizes.
         image_px: wanted height; the images are reduced by the nearest whole factor.
         masks: (H, W) bool, False where a pixel is unknown or occluded.
@@ -166,12 +166,12 @@ def _checked(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]
         coverage = (apart > BACKGROUND_TOLERANCE).astype(np.float32)
         if coverage.mean() < 1e-4:
             raise ValueError(
-                "the goal image is blank: every pixel has the colour of the border; give an "
+                "the goal image is blank: every pixel has the color of the border; give an "
                 "image that shows the robot"
             )
         if coverage.mean() > MOST:
             raise ValueError(
-                f"{100 * coverage.mean():.0f} % of the goal image differ from the colour of its "
+                f"{100 * coverage.mean():.0f} % of the goal image differ from the color of its "
                 "border; expected a plain background, or the robot's mask as fourth channel"
             )
     return image[..., :3] * coverage[..., None], coverage

@@ -40,7 +40,7 @@ def goal_loss(
 def _views(
     chain: Chain, splats: SplatModel, cameras: Camera, q: jax.Array, windows: Windows | None
 ) -> list[tuple[jax.Array, jax.Array]]:
-    """Colour and coverage in each of the V views."""
+    """Color and coverage in each of the V views."""
     poses = link_poses(chain, q)
     each = [jax.tree.map(lambda leaf: leaf[v], cameras) for v in range(len(cameras.focal))]  # noqa: B023
     return [render(splats, poses, camera, windows) for camera in each]

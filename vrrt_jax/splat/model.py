@@ -15,7 +15,16 @@ from vrrt_jax.splat.types import SplatModel
 FORMAT = 3
 CLOSE_UP = "close_up"
 NEARLY = 1.125  # a level serves images so many times as high as those it was trained for
-ARRAYS = ("mean", "radius", "density", "rgb", "shade", "link", "tau")
+# Fields of the splats, and what the file calls them.
+ARRAYS = {
+    "mean": "mean",
+    "radius": "radius",
+    "density": "density",
+    "rgb": "rgb",
+    "view_color_gradient": "shade",
+    "link": "link",
+    "tau": "tau",
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -25,7 +34,7 @@ class Level:
     splats: SplatModel
     size_px: int  # image height that it was trained at [px]
     psnr_db: float  # on unseen poses and cameras, over RGB and coverage
-    match_bar: float  # loss over covered share, under which 95 % of true poses lie
+    match_threshold: float  # loss over covered share, under which 95 % of true poses lie
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,7 +68,7 @@ def save_self_model(model: SelfModel, path: str | Path) -> None:
             name: {
                 "size_px": level.size_px,
                 "psnr_db": level.psnr_db,
-                "match_bar": level.match_bar,
+                "match_bar": level.match_threshold,
                 "starts": level.splats.starts,
             }
             for name, level in named.items()
@@ -67,8 +76,8 @@ def save_self_model(model: SelfModel, path: str | Path) -> None:
     }
     arrays: dict[str, Any] = {"header": np.array(json.dumps(header))}
     for name, level in named.items():
-        for array in ARRAYS:
-            value = np.asarray(getattr(level.splats, array))
+        for field, array in ARRAYS.items():
+            value = np.asarray(getattr(level.splats, field))
             small = np.uint8 if array == "link" else np.float16 if value.ndim else np.float32
             arrays[f"{name}/{array}"] = value.astype(small)
     with replacing(path) as file:
@@ -102,16 +111,16 @@ def load_self_model(path: str | Path) -> SelfModel:
         name: Level(
             splats=SplatModel(
                 **{
-                    array: jnp.asarray(
+                    field: jnp.asarray(
                         arrays[f"{name}/{array}"], jnp.int32 if array == "link" else jnp.float32
                     )
-                    for array in ARRAYS
+                    for field, array in ARRAYS.items()
                 },
                 starts=tuple(numbers["starts"]),
             ),
             size_px=numbers["size_px"],
             psnr_db=numbers["psnr_db"],
-            match_bar=numbers["match_bar"],
+            match_threshold=numbers["match_bar"],
         )
         for name, numbers in header["levels"].items()
     }

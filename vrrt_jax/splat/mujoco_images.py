@@ -160,8 +160,8 @@ def _set_camera(scene: mujoco.MjvScene, camera: Camera, model: mujoco.MjModel) -
     world_to_cam = np.asarray(camera.world_to_cam, np.float64)
     rotation = world_to_cam[:3, :3]
     eye = -rotation.T @ world_to_cam[:3, 3]
-    focal, (cx, cy) = float(camera.focal), np.asarray(camera.centre, np.float64)
-    # MuJoCo turns its depth buffer into metres with these planes, so they are not ours to choose.
+    focal, (cx, cy) = float(camera.focal), np.asarray(camera.principal_point, np.float64)
+    # MuJoCo turns its depth buffer into meters with these planes, so they are not ours to choose.
     near = model.vis.map.znear * model.stat.extent
     far = model.vis.map.zfar * model.stat.extent
     for view in scene.camera:

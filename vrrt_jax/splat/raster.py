@@ -2,7 +2,7 @@
 
 The footprint of an isotropic Gaussian is a row profile times a column profile, so the sum of all
 splats' features over the image is one product of matrices, and its gradient two more. There is no
-sort, no tile and no cut-off: every splat keeps a gradient. Occlusion is a soft z-buffer: colours
+sort, no tile and no cut-off: every splat keeps a gradient. Occlusion is a soft z-buffer: colors
 are averaged with weights that fall off with depth behind the nearest splat. As a near splat then
 outshines far ones even where it is faint, silhouettes before the robot's own body would grow. So
 links are drawn in layers, an arm apart from its base, say, and a layer hides another where it is
@@ -31,10 +31,10 @@ LANES = 32  # that are rendered at once
 NEAR = 0.05  # [m] splats nearer than this to the camera plane are not drawn
 PIXEL_BLUR = 0.1  # [px] a pixel's own footprint, added to every splat's; more costs up to 3 dB
 # The faintest footprint that counts in a float32 coverage, 6e-8, times exp(-66) is still a normal
-# number. So a splat keeps its colour however far it is behind the nearest one.
+# number. So a splat keeps its color however far it is behind the nearest one.
 MIN_LOG_WEIGHT = -66.0
 MIN_WEIGHT = 1e-37
-FAINTEST = 1e-3  # what a splat may add to colour or coverage outside its window
+FAINTEST = 1e-3  # what a splat may add to color or coverage outside its window
 
 
 @pytree
@@ -108,7 +108,7 @@ def splat_sum(
     """Sum over splats of Gaussian footprint times feature.
 
     Args:
-        pixel: (G, 2) centres x, y [px].
+        pixel: (G, 2) centers x, y [px].
         inv_sigma: (G,) one over the standard deviation [1/px].
         features: (G, C).
         size: (H, W), static.
@@ -127,18 +127,22 @@ def _project(model: SplatModel, poses: jax.Array, camera: Camera) -> tuple[_Spla
     of_link = jax.nn.one_hot(model.link, len(poses), dtype=poses.dtype, axis=0)
     mean = jnp.concatenate([model.mean.T, jnp.ones_like(model.radius)[None]])
     point = _by_link(link_to_cam, of_link, mean)
-    shade = _by_link(link_to_cam[:, :, :3], of_link, model.shade.T)
+    view_color_gradient = _by_link(link_to_cam[:, :, :3], of_link, model.view_color_gradient.T)
     visible = point[2] > NEAR
     depth = jnp.where(visible, point[2], 1.0)
     away = lax.rsqrt(point[0] ** 2 + point[1] ** 2 + point[2] ** 2 + 1e-12) * point
-    lit = 1.0 - (away[0] * shade[0] + away[1] * shade[1] + away[2] * shade[2])
+    lit = 1.0 - (
+        away[0] * view_color_gradient[0]
+        + away[1] * view_color_gradient[1]
+        + away[2] * view_color_gradient[2]
+    )
     density = jnp.where(visible, model.density, 0.0)
     nearest = jnp.min(jnp.where(visible, depth, jnp.inf))
     nearest = lax.stop_gradient(jnp.where(jnp.isfinite(nearest), nearest, 1.0))
     behind = jnp.where(visible, (nearest - depth) / model.tau, 0.0)
     weight = density * jnp.exp(jnp.maximum(behind, MIN_LOG_WEIGHT))
     splats = _Splats(
-        pixel=camera.focal * point[:2] / depth + camera.centre[:, None],
+        pixel=camera.focal * point[:2] / depth + camera.principal_point[:, None],
         inv_sigma=lax.rsqrt((camera.focal * model.radius / depth) ** 2 + PIXEL_BLUR**2),
         features=jnp.concatenate([model.rgb.T * (weight * lit), weight[None], density[None]]),
     )
@@ -154,7 +158,7 @@ def _by_link(matrices: jax.Array, of_link: jax.Array, vectors: jax.Array) -> jax
 
 @jax.custom_vjp
 def _composite(total: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Colour (3, H, W) and coverage (H, W) from sums (L, 5, H, W) of the layers.
+    """Color (3, H, W) and coverage (H, W) from sums (L, 5, H, W) of the layers.
 
     The channels are weighted rgb, weight and density.
     """
@@ -165,13 +169,13 @@ def _composite_fwd(total):
     # Weights may be so small that their square, which automatic derivatives take, underflows.
     inverse = 1.0 / (total[:, 3] + MIN_WEIGHT)
     coverage = 1.0 - jnp.exp(-total[:, 4])
-    colour = total[:, :3] * inverse[:, None]
-    rgb = colour * coverage[:, None]
+    color = total[:, :3] * inverse[:, None]
+    rgb = color * coverage[:, None]
     over, merges = (rgb[0], coverage[0], total[0, 3]), []
     for layer in range(1, len(total)):
         merges.append(over)
         over = _merge(over, (rgb[layer], coverage[layer], total[layer, 3]))
-    return over[:2], (colour, rgb, coverage, inverse, merges, total[:, 3])
+    return over[:2], (color, rgb, coverage, inverse, merges, total[:, 3])
 
 
 def _merge(a, b):
@@ -206,7 +210,7 @@ def _merge_bar(a, b, bars):
 
 
 def _composite_bwd(residuals, bars):
-    colour, rgb, coverage, inverse, merges, weight = residuals
+    color, rgb, coverage, inverse, merges, weight = residuals
     bars, layer_bars = (*bars, jnp.zeros_like(bars[1])), []
     for layer in range(len(merges), 0, -1):
         own = (rgb[layer], coverage[layer], weight[layer])
@@ -214,7 +218,7 @@ def _composite_bwd(residuals, bars):
         layer_bars.insert(0, own_bars)
     total_bars = []
     for layer, (rgb_bar, cover_bar, weight_bar) in enumerate([bars, *layer_bars]):
-        along = sum(rgb_bar[c] * colour[layer, c] for c in range(3))
+        along = sum(rgb_bar[c] * color[layer, c] for c in range(3))
         scale = coverage[layer] * inverse[layer]
         density_bar = (cover_bar + along) * (1.0 - coverage[layer])
         total_bars += [rgb_bar * scale, (weight_bar - along * scale)[None], density_bar[None]]
@@ -373,9 +377,9 @@ def _profiles(clusters: _Splats, corner: jax.Array, window: tuple[int, int]):
     """For x and y: offsets (K, n, g) of n pixels in standard deviations, and footprints."""
     profiles = []
     for axis, n in ((0, window[1]), (1, window[0])):
-        centre = clusters.pixel[:, axis] - corner[axis][:, None]
-        pixel = jnp.arange(n, dtype=centre.dtype)[:, None] + 0.5
-        offset = (pixel - centre[:, None]) * clusters.inv_sigma[:, None]
+        center = clusters.pixel[:, axis] - corner[axis][:, None]
+        pixel = jnp.arange(n, dtype=center.dtype)[:, None] + 0.5
+        offset = (pixel - center[:, None]) * clusters.inv_sigma[:, None]
         profiles.append((offset, jnp.exp(-0.5 * offset**2)))
     return profiles
 
@@ -450,7 +454,7 @@ def _extents(
 def choose_windows(
     model: SplatModel, poses: jax.Array, camera: Camera
 ) -> tuple[SplatModel, Windows | None]:
-    """Group splats into clusters of neighbours on one link, and find windows that hold them.
+    """Group splats into clusters of neighbors on one link, and find windows that hold them.
 
     Args:
         model: splats bound to links.

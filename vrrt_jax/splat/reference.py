@@ -20,8 +20,8 @@ class Gaussians:
     mean: jax.Array  # (G, 3) [m]
     quaternion: jax.Array  # (G, 4) wxyz, principal axes to world; need not have length 1
     scale: jax.Array  # (G, 3) standard deviations along the principal axes [m]
-    density: jax.Array  # (G,) optical depth at the centre
-    rgb: jax.Array  # (G, 3) colour towards the camera
+    density: jax.Array  # (G,) optical depth at the center
+    rgb: jax.Array  # (G, 3) color towards the camera
 
 
 def composite(
@@ -35,10 +35,10 @@ def composite(
     """Draw splats front to back, each with opacity ``1 - exp(-density * footprint)``.
 
     Args:
-        pixel: (G, 2) centres x, y [px].
+        pixel: (G, 2) centers x, y [px].
         covariance: (G, 2, 2) of the footprints [px^2]; not singular.
         depth: (G,) for the order only.
-        density: (G,) optical depth at the centre.
+        density: (G,) optical depth at the center.
         rgb: (G, 3).
         size: (H, W), static.
 
@@ -48,8 +48,8 @@ def composite(
     order = jnp.argsort(depth)
     y, x = (jnp.arange(n, dtype=pixel.dtype) + 0.5 for n in size)
 
-    def optical_depth(centre, covariance, density):
-        dx, dy = x[None] - centre[0], y[:, None] - centre[1]
+    def optical_depth(center, covariance, density):
+        dx, dy = x[None] - center[0], y[:, None] - center[1]
         (xx, xy), (_, yy) = covariance
         squared = (yy * dx**2 - 2.0 * xy * dx * dy + xx * dy**2) / (xx * yy - xy**2)
         return density * jnp.exp(-0.5 * squared)
@@ -85,7 +85,7 @@ def _projected_covariance(gaussians: Gaussians, camera: Camera, depth: jax.Array
     slope = (gaussians.mean @ rotation.T + translation)[:, :2] / depth[:, None]
     # Far outside the image the approximation explodes.
     size = jnp.array([camera.width, camera.height], slope.dtype)
-    limit = 1.3 * jnp.maximum(camera.centre, size - camera.centre) / camera.focal
+    limit = 1.3 * jnp.maximum(camera.principal_point, size - camera.principal_point) / camera.focal
     slope = jnp.clip(slope, -limit, limit)
     jacobian = jnp.concatenate(
         [jnp.broadcast_to(jnp.eye(2), (len(slope), 2, 2)), -slope[:, :, None]], axis=2
@@ -131,6 +131,6 @@ def render_reference(
     to_eye = eye - mean
     to_eye = to_eye * jax.lax.rsqrt(jnp.sum(to_eye**2, axis=-1, keepdims=True) + 1e-12)
     view = jnp.einsum("gij,gi->gj", rotation, to_eye)
-    rgb = model.rgb * (1.0 + jnp.sum(model.shade * view, axis=-1, keepdims=True))
+    rgb = model.rgb * (1.0 + jnp.sum(model.view_color_gradient * view, axis=-1, keepdims=True))
     density = jnp.where(visible, model.density, 0.0)
     return composite(pixel, covariance, depth, density, rgb, (camera.height, camera.width))

@@ -16,7 +16,7 @@ class Camera:
 
     world_to_cam: jax.Array  # (4, 4) rigid transform
     focal: jax.Array  # () [px], square pixels
-    centre: jax.Array  # (2,) principal point x, y [px]; the centre of pixel 0 is at 0.5
+    principal_point: jax.Array  # (2,) x, y [px]; the center of pixel 0 is at 0.5
     height: int = static()  # [px]
     width: int = static()  # [px]
 
@@ -25,11 +25,13 @@ class Camera:
 class SplatModel:
     """Isotropic splats bound rigidly to a robot's links, sorted by link."""
 
-    mean: jax.Array  # (G, 3) centre in the link's frame [m]
+    mean: jax.Array  # (G, 3) center in the link's frame [m]
     radius: jax.Array  # (G,) standard deviation [m]
-    density: jax.Array  # (G,) optical depth at the centre; coverage = 1 - exp(-sum)
-    rgb: jax.Array  # (G, 3) colour seen from nowhere in particular
-    shade: jax.Array  # (G, 3) colour factor = 1 + shade . direction to the camera, in link frame
+    density: jax.Array  # (G,) optical depth at the center; coverage = 1 - exp(-sum)
+    rgb: jax.Array  # (G, 3) color seen from nowhere in particular
+    view_color_gradient: (
+        jax.Array
+    )  # (G, 3) color factor = 1 + view_color_gradient . direction to the camera, in link frame
     link: jax.Array  # (G,) i32
     tau: jax.Array  # () softness of occlusion [m]
     starts: tuple[int, ...] = static(default=(0,))  # first splat of each layer of whole links

@@ -14,23 +14,23 @@ from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import unwrapped
 from vrrt_jax.core.planners.rrt import tree_path
 from vrrt_jax.core.planners.rrt_connect import RRTConnect, connection_path
-from vrrt_jax.core.search import SearchResult, Stopped, make_stop, search
+from vrrt_jax.core.search import SearchResult, StopReason, make_termination, search
 from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import Rejection, Status
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.exact import exact_model
+from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.verify import verify_path
 from vrrt_jax.scene.world import World, obstacle_list, with_margin
 from vrrt_jax.visual.polish import DISTINCT, Polishing, apart, glance, look_at, polish
 
 STATUS_OF = {
-    Stopped.CONVERGED: Status.NO_MATCH,
-    Stopped.ITERATIONS: Status.BUDGET,
-    Stopped.TREE_FULL: Status.TREE_FULL,
-    Stopped.TIME_LIMIT: Status.TIME_LIMIT,
-    Stopped.INTERRUPTED: Status.INTERRUPTED,
+    StopReason.CONVERGED: Status.NO_MATCH,
+    StopReason.ITERATIONS: Status.MAX_ITERATIONS,
+    StopReason.TREE_FULL: Status.TREE_FULL,
+    StopReason.TIME_LIMIT: Status.TIME_LIMIT,
+    StopReason.INTERRUPTED: Status.INTERRUPTED,
 }
-HURRIED = (Stopped.TIME_LIMIT, Stopped.INTERRUPTED)  # what ends these, ends all
+HURRIED = (StopReason.TIME_LIMIT, StopReason.INTERRUPTED)  # what ends these, ends all
 TRIED = 3  # matched configurations that are tried before there is no path
 REFUSED = 3  # paths that the exact check may refuse before it has the last word
 WARY = 0.01  # [m] by which each of them keeps farther away than the one before
@@ -80,7 +80,7 @@ def finish_visual(
         ends = list(_distinct(world, score, q, q_start, TRIED, goal_loss))
         paths = {end: tree_path(found.tree, end) for end in ends}
         paths = {end: path for end, path in paths.items() if np.array_equal(path[0], q_start)}
-        rivals, cost = [], score  # on a small image even neighbours look the same
+        rivals, cost = [], score  # on a small image even neighbors look the same
     for end in ends[:TRIED]:
         path = paths.get(end)
         if path is None:
@@ -136,7 +136,7 @@ def _straight(
     The exact check judges, which also grants what the covering spheres refuse.
     """
     obstacles = obstacle_list(world)
-    exact_model(robot, obstacles)  # built once, and no part of any search
+    exact_scene(robot, obstacles)  # built once, and no part of any search
     started = time.perf_counter()
     path = np.stack([q_start, q_goal])
     seen = verify_path(robot, obstacles, path, step=GLANCE)
@@ -160,7 +160,7 @@ def _connected(
     """
     policy = RRTConnect(lanes=config.lanes)
     tree = policy.forest(jnp.asarray(q_start), jnp.asarray(q_goal), config.capacity)
-    stop = make_stop(0.0, max_iterations=config.connect_iterations)
+    stop = make_termination(0.0, max_iterations=config.connect_iterations)
     limit_s = time_left(config, found.search_s).time_limit_s
     connection = search(world, policy, tree, key=key, stop=stop, time_limit_s=limit_s)
     found = dataclasses.replace(

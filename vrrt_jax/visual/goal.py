@@ -10,7 +10,7 @@ import numpy as np
 
 from vrrt_jax import checks
 from vrrt_jax.config import PlannerConfig
-from vrrt_jax.core.search import Stop, make_stop
+from vrrt_jax.core.search import Termination, make_termination
 from vrrt_jax.robots.kinematics import batch_link_poses
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.splat.images import prepare_goal
@@ -65,7 +65,7 @@ class Sight:
         splats, windows = _windowed(self.robot, level.splats, cameras)
         covered = float(jnp.sum(goal.valid * goal.coverage) / jnp.sum(goal.valid))
         fields = {"splats": splats, "windows": windows, "cameras": cameras, "goal": goal}
-        return fields, match_scale * level.match_bar * covered
+        return fields, match_scale * level.match_threshold * covered
 
     def close_up(self, policy: VisualPolicy, image_px: int, match_scale: float) -> CloseUp | None:
         """How to look at a part of images of a height; not at all, where they are much smaller."""
@@ -77,7 +77,7 @@ class Sight:
         return CloseUp(
             policy=dataclasses.replace(policy, **seen),
             px=level.size_px,
-            match_bar=match_scale * level.match_bar,
+            match_threshold=match_scale * level.match_threshold,
         )
 
 
@@ -180,9 +180,9 @@ def visual_polishing(
     )
 
 
-def visual_stop(config: PlannerConfig, goal_loss: float) -> Stop:
+def visual_termination(config: PlannerConfig, goal_loss: float) -> Termination:
     """When the search ends."""
-    return make_stop(
+    return make_termination(
         goal_loss,
         settle=config.settle,
         max_iterations=config.max_iterations,

@@ -13,8 +13,8 @@ import numpy as np
 import optax
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import difference, into_limits
-from vrrt_jax.core.parallel import on_cores
+from vrrt_jax.core.edges import difference, enforce_bounds
+from vrrt_jax.core.parallel import map_on_threads
 from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.rewire import rewire
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
@@ -144,13 +144,13 @@ class VisualPolicy:
         shrink = jnp.sqrt(jnp.minimum(1.0, loss / jnp.maximum(self.anneal_loss, 1e-12)))
         step = -self.alpha * shrink[:, None] * jnp.asarray(direction)
         # Momentum into a limit would only hold the joint there.
-        stuck = ~world.wraps & ((q + step < world.lower) | (q + step > world.upper))
+        stuck = ~world.is_continuous & ((q + step < world.lower) | (q + step > world.upper))
         return step, state._replace(mu=jnp.where(stuck, 0.0, state.mu))
 
     def evaluate(self, world: World, q: jax.Array, proposals: Proposals):
         """Losses (B,) and payloads of the children."""
         loss, grad = map_lanes(jax.value_and_grad(lambda q: self.loss(world, q)), q)
-        _, adam = proposals.carry
+        _, adam = proposals.aux
         return loss, VisualNode(grad=grad, adam=adam, exploited=jnp.zeros(self.lanes, bool))
 
     def after_insert(
@@ -161,7 +161,7 @@ class VisualPolicy:
         expansion: Expansion,
     ) -> Tree[VisualNode]:
         """Mark parents as exploited, also those whose step was blocked; rewire."""
-        exploits, _ = proposals.carry
+        exploits, _ = proposals.aux
         taken = jnp.where(exploits, proposals.parent, tree.capacity)
         exploited = tree.payload.exploited.at[taken].set(True, mode="drop")
         tree = dataclasses.replace(
@@ -217,7 +217,7 @@ def plant(
         capacity: slots of the tree.
     """
     keys = jax.random.split(key, probing.parts)
-    probes = on_cores(lambda key: best_probes(world, probing, q_roots[0], key), keys)
+    probes = map_on_threads(lambda key: best_probes(world, probing, q_roots[0], key), keys)
     # As many in all as descended, so that lanes come out even and compile once.
     num = max(probing.parts * probing.kept, len(q_roots))
     return forest(world, policy, np.concatenate([q_roots, *probes])[:num], capacity)
@@ -241,7 +241,7 @@ def best_probes(world: World, probing: Probing, q_start: jax.Array, key: jax.Arr
     direction = jax.random.normal(key_direction, (probing.num, len(q_start)))
     direction /= jnp.linalg.norm(direction, axis=1, keepdims=True)
     distance = probing.radius * jax.random.uniform(key_distance, (probing.num, 1))
-    q = into_limits(world, q_start + distance * direction)
+    q = enforce_bounds(world, q_start + distance * direction)
     loss = _probe(world, probing, q)
     _, best = jax.lax.top_k(-loss, probing.kept)
     return _descend(world, probing, _evolve(world, probing, q[best], loss[best], key_children))
@@ -272,7 +272,7 @@ def _evolve(
         share = jax.random.uniform(key_share, (*shape[:2], 1), minval=0.2)
         moved = jax.random.uniform(key_moved, shape) < share
         step = spread * moved * jax.random.normal(key_step, shape)
-        children = into_limits(world, (q[:, None] + step).reshape(-1, joints))
+        children = enforce_bounds(world, (q[:, None] + step).reshape(-1, joints))
         losses = _probe(world, probing, children).reshape(num, CHILDREN)
         best = jnp.argmin(losses, axis=1)
         lowest = jnp.min(losses, axis=1)
@@ -292,7 +292,7 @@ def _descend(world: World, probing: Probing, q: jax.Array) -> jax.Array:
         q, state = carry
         direction, state = adam.update(map_lanes(gradient, q), state)
         length = probing.policy.alpha * (1.0 - i / probing.steps)
-        return into_limits(world, q - length * direction), state
+        return enforce_bounds(world, q - length * direction), state
 
     end, _ = jax.lax.fori_loop(0, probing.steps, step, (q, adam.init(q)))
     free = jax.vmap(is_free, (None, 0))(world, end)

@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.edges import difference, into_limits
-from vrrt_jax.core.parallel import on_cores
+from vrrt_jax.core.edges import difference, enforce_bounds
+from vrrt_jax.core.parallel import map_on_threads
 from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.scene.world import World, is_free
@@ -57,7 +57,7 @@ class CloseUp:
 
     policy: VisualPolicy  # only its loss is used; it sees whole images, of which a part is cut
     px: int  # height and width of the part
-    match_bar: float  # loss of a match, in units of the part's covered share
+    match_threshold: float  # loss of a match, in units of the part's covered share
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -137,7 +137,7 @@ def apart(world: World, q: np.ndarray, q_other: np.ndarray) -> np.ndarray:
 def _steps(world: World, q_from: np.ndarray, q_to: np.ndarray) -> np.ndarray:
     """From configurations (n, D) to others, the short way round."""
     step = q_to - q_from
-    return step - 2 * np.pi * np.round(step / (2 * np.pi)) * np.asarray(world.wraps)
+    return step - 2 * np.pi * np.round(step / (2 * np.pi)) * np.asarray(world.is_continuous)
 
 
 def _last_hinge(world: World) -> int:
@@ -205,7 +205,7 @@ def _at_hand(world: World, fine: Closer, close_up: CloseUp, q: np.ndarray) -> tu
     covered = float(np.mean(goal.valid * goal.coverage)) / known
     policy = dataclasses.replace(whole, goal=goal, cameras=cameras)
     closer = dataclasses.replace(fine, policy=policy, prior=jnp.float32(0))
-    return closer, close_up.match_bar * max(covered, LEAST_COVERED) / known
+    return closer, close_up.match_threshold * max(covered, LEAST_COVERED) / known
 
 
 @jax.jit
@@ -249,14 +249,14 @@ def _in_blocks(
     """Arrays (n, ...) about configurations (n, D), a few at a time: one program serves any n."""
     blocks = -(-len(q) // size)
     padded = np.resize(q, (blocks * size, q.shape[1])).astype(np.float32)
-    seen = on_cores(lambda block: function(world, closer, block), np.split(padded, blocks))
+    seen = map_on_threads(lambda block: function(world, closer, block), np.split(padded, blocks))
     return [np.concatenate(column)[: len(q)] for column in zip(*seen, strict=True)]
 
 
 @jax.jit
 def glance(world: World, closer: Closer, q: jax.Array) -> tuple[jax.Array]:
     """The cost alone (n,), see :class:`_Look`."""
-    q = into_limits(world, q)
+    q = enforce_bounds(world, q)
     loss = map_lanes(lambda q: closer.policy.loss(world, q), q)
     away = difference(world, closer.q_start, q)
     return (loss + closer.prior * jnp.sum(away**2, axis=1),)
@@ -266,7 +266,7 @@ def glance(world: World, closer: Closer, q: jax.Array) -> tuple[jax.Array]:
 def look_at(world: World, closer: Closer, q: jax.Array) -> tuple[jax.Array, ...]:
     """Columns of a :class:`_Look`; derivatives are finite differences."""
     policy, joints = closer.policy, q.shape[1]
-    q = into_limits(world, q)
+    q = enforce_bounds(world, q)
     places = q[:, None] + PROBE * jnp.eye(joints + 1, joints, -1)
 
     def image(q):

@@ -38,7 +38,7 @@ def reachable(passable: np.ndarray, start: tuple[int, int]) -> np.ndarray:
 
 
 def roomy(solid: np.ndarray) -> np.ndarray:
-    """Cells (X, Y) more than 0.35 m from the centre of any solid one, by shifting the map."""
+    """Cells (X, Y) more than 0.35 m from the center of any solid one, by shifting the map."""
     ok = np.ones_like(solid)
     padded = np.pad(solid, 3, constant_values=True)
     for i in range(-3, 4):

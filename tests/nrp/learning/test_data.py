@@ -193,11 +193,11 @@ def test_windows(rng):
     q = rng.uniform([0, 0], [7, 6], (200, 2)).astype(np.float32)
     q[:3] = [[0, 0], [7, 6], [0.04, 5.96]]
     windows = np.asarray(jax.vmap(local_map.window, (None, 0))(padded, jnp.asarray(q)))
-    centres = np.asarray(local_map.centre(jnp.asarray(q)))
+    centers = np.asarray(local_map.center(jnp.asarray(q)))
     assert windows.shape == (200, 40, 40, 3)
-    assert np.abs(centres - q).max() <= 0.0501
-    for window, centre in zip(windows, centres, strict=True):
-        corner = np.round(centre * 10).astype(int) - 20
+    assert np.abs(centers - q).max() <= 0.0501
+    for window, center in zip(windows, centers, strict=True):
+        corner = np.round(center * 10).astype(int) - 20
         expected = np.ones((40, 40, 3), bool)
         for i, j in np.ndindex(40, 40):
             x, y = corner[0] + i, corner[1] + j
@@ -214,5 +214,5 @@ def test_windows_of_a_map_with_an_origin_and_of_stacked_maps(rng):
     stacked = jnp.stack([with_border(m) for m in maps])
     assert (shifted == plain).all()
     assert (local_map.stacked_window(stacked, jnp.int32(1), q) == plain).all()
-    moved = local_map.centre(q - jnp.array([2.0, 1.0]), 0.1, (-2.0, -1.0))
+    moved = local_map.center(q - jnp.array([2.0, 1.0]), 0.1, (-2.0, -1.0))
     assert np.asarray(moved) == pytest.approx([-0.8, 2.2], abs=1e-5)

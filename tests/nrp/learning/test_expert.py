@@ -40,7 +40,7 @@ def rows(robot, world, roadmap):
 def between(world, a, b, fractions):
     """Configurations (n, D) on the straight edge from a to b."""
     step = b - a
-    turns = np.where(np.asarray(world.wraps), np.round(step / (2 * np.pi)), 0)
+    turns = np.where(np.asarray(world.is_continuous), np.round(step / (2 * np.pi)), 0)
     return a + np.asarray(fractions)[:, None] * (step - 2 * np.pi * turns)
 
 

@@ -123,11 +123,11 @@ def test_images_show_what_surrounds_the_start():
     config = ModelConfig.default("snake", "discriminator")
     padded = surrounding_map(config, world.field)
     q = jnp.zeros(8).at[:2].set(jnp.array([1.23, 4.77]))
-    image, centre = view(config, padded, q, jnp.float32(RESOLUTION), jnp.zeros(2))
+    image, center = view(config, padded, q, jnp.float32(RESOLUTION), jnp.zeros(2))
     image = np.asarray(image)
-    np.testing.assert_allclose(centre, [1.2, 4.8], atol=1e-6)
+    np.testing.assert_allclose(center, [1.2, 4.8], atol=1e-6)
     for cell in np.ndindex(40, 40):
-        place = np.round(np.asarray(centre) / RESOLUTION).astype(int) - 20 + cell
+        place = np.round(np.asarray(center) / RESOLUTION).astype(int) - 20 + cell
         inside = (place >= 0).all() and (place < 60).all()
         solid = not inside or grid.occupied[place[0], place[1], 0]
         assert (image[*cell, 0] == 0.0) == solid

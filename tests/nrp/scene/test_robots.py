@@ -31,7 +31,7 @@ def test_joints(robot):
     assert np.all(robot.lower < robot.upper)
     if robot.name == "fetch":
         np.testing.assert_allclose([robot.lower[0], robot.upper[0]], [0.1, 0.38615])
-        assert robot.wraps.tolist() == [False, False, True, False] + [
+        assert robot.is_continuous.tolist() == [False, False, True, False] + [
             name in ("upperarm_roll", "forearm_roll", "wrist_roll")
             for name in robot.joint_names[4:]
         ]
@@ -75,7 +75,7 @@ def test_straight_arm_of_the_fetch():
 )
 def test_spheres_cover_their_geom(rng, kind, size):
     size = np.array(size, float)
-    centre, radius = cover_geom(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"), size, 0.03)
+    center, radius = cover_geom(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"), size, 0.03)
     if kind == "BOX":
         points = rng.uniform(-size, size, (5000, 3))
         corners = size * np.array(list(itertools.product((-1, 1), repeat=3)))
@@ -84,7 +84,7 @@ def test_spheres_cover_their_geom(rng, kind, size):
         ball = rng.normal(size=(5000, 3))
         ball *= size[0] / np.linalg.norm(ball, axis=1, keepdims=True)
         points = ball + np.outer(rng.uniform(-size[1], size[1], 5000), [0, 0, 1])
-    gap = np.linalg.norm(points[:, None] - centre, axis=2) - radius
+    gap = np.linalg.norm(points[:, None] - center, axis=2) - radius
     assert gap.min(axis=1).max() < 1e-9
     assert radius.max() < np.sort(size)[-2] + 0.04
 
@@ -98,16 +98,21 @@ def test_cover_contains_the_primitives_at_any_configuration(robot, rng):
     for q in random_q(robot, rng, 3):
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
-        pose = np.asarray(link_poses(robot.chain, jnp.asarray(q)))[np.asarray(robot.cover.link)]
-        centre = np.einsum("nij,nj->ni", pose[:, :3, :3], robot.cover.centre) + pose[:, :3, 3]
+        pose = np.asarray(link_poses(robot.chain, jnp.asarray(q)))[
+            np.asarray(robot.collision_spheres.link)
+        ]
+        center = (
+            np.einsum("nij,nj->ni", pose[:, :3, :3], robot.collision_spheres.center)
+            + pose[:, :3, 3]
+        )
         for geom in range(model.ngeom):
             if model.geom(geom).name == "footprint":
                 continue
             points = _outer_points(mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom])
             points = points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
             axes = slice(0, 2) if robot.planar else slice(0, 3)
-            gap = np.linalg.norm(points[:, None, axes] - centre[:, axes], axis=2)
-            assert (gap - np.asarray(robot.cover.radius)).min(axis=1).max() < 1e-5
+            gap = np.linalg.norm(points[:, None, axes] - center[:, axes], axis=2)
+            assert (gap - np.asarray(robot.collision_spheres.radius)).min(axis=1).max() < 1e-5
 
 
 def test_only_links_of_one_layer_of_the_snake_are_checked():

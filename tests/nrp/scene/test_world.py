@@ -13,7 +13,7 @@ from nrp_jax.bench import checks
 from nrp_jax.bench.checks import SphereLoop
 from nrp_jax.homes.grid import coarsened, load_map
 from nrp_jax.scene.exact import ExactScene, merge_cells
-from nrp_jax.scene.field import make_field, room
+from nrp_jax.scene.field import clearance_bound, make_field
 from vrrt_jax.core.edges import free_steps
 from vrrt_jax.core.planners.rrt import sample_configurations
 
@@ -55,7 +55,7 @@ def test_room_is_a_close_lower_bound(worlds, rng, name):
     low, high = np.array(grid.origin), grid.origin + grid.size
     points = rng.uniform(low - 0.2, high + 0.2, (4000, 3))
     exact = distance_to_cells(grid, points)
-    found = np.asarray(room(make_field(grid), jnp.asarray(points.T, jnp.float32)))
+    found = np.asarray(clearance_bound(make_field(grid), jnp.asarray(points.T, jnp.float32)))
     assert np.all(found <= exact + 1e-5)
     between = (exact > 0) & (points[:, 2] > low[2]) & (points[:, 2] < high[2])
     assert np.mean(exact[between] - found[between]) < (0.006 if grid.planar else 0.03)
@@ -137,14 +137,14 @@ def test_edges_and_metric(worlds, name):
     np.testing.assert_allclose(world.distance(q_a, q_b), world.distance(q_b, q_a), rtol=1e-4)
     if name == "snake":
         step = np.array(q_b - q_a)
-        step[:, 2] = (step[:, 2] + np.pi) % (2 * np.pi) - np.pi  # q1 alone wraps
+        step[:, 2] = (step[:, 2] + np.pi) % (2 * np.pi) - np.pi  # q1 alone is_continuous
         base, arm = np.linalg.norm(step[:, :2], axis=1), np.linalg.norm(step[:, 2:], axis=1)
         np.testing.assert_allclose(world.distance(q_a, q_b), base + 0.167 * arm, rtol=1e-4)
     ends = [world.interpolate(q_a, q_b, f) for f in (0.0, 1.0)]
     for end, q in zip(ends, (q_a, q_b), strict=True):
         apart = np.array(end - q)
-        wraps = np.asarray(world.wraps)
-        apart[:, wraps] = (apart[:, wraps] + np.pi) % (2 * np.pi) - np.pi
+        is_continuous = np.asarray(world.is_continuous)
+        apart[:, is_continuous] = (apart[:, is_continuous] + np.pi) % (2 * np.pi) - np.pi
         assert np.abs(apart).max() < 1e-3
     middle = world.interpolate(q_a, q_b, 0.5)
     first, second = world.distance(q_a, middle), world.distance(middle, q_b)
@@ -161,8 +161,8 @@ def test_no_joint_moves_farther_in_a_sub_step_than_the_resolution(worlds, name):
     for start, end, parts in zip(q_a, q_b, num.astype(int), strict=True):
         fraction = np.minimum(np.arange(200) / parts, 1.0).astype(np.float32)
         step = np.diff(world.interpolate(start[None], end[None], fraction), axis=0)
-        wraps = np.asarray(world.wraps)
-        step[:, wraps] = (step[:, wraps] + np.pi) % (2 * np.pi) - np.pi
+        is_continuous = np.asarray(world.is_continuous)
+        step[:, is_continuous] = (step[:, is_continuous] + np.pi) % (2 * np.pi) - np.pi
         assert np.abs(step).max() <= 1.01 * float(world.resolution)
 
 
@@ -242,9 +242,9 @@ def test_what_lies_below_the_floor_is_in_nobodys_way():
 def test_ros_map(tmp_path, free_thresh, negate, mode):
     from PIL import Image
 
-    grey = np.full((40, 61), 254, np.uint8)
-    grey[10, 20], grey[30, 40] = 0, 205  # solid, unknown
-    Image.fromarray(255 - grey if negate else grey).save(tmp_path / "home.pgm")
+    gray = np.full((40, 61), 254, np.uint8)
+    gray[10, 20], gray[30, 40] = 0, 205  # solid, unknown
+    Image.fromarray(255 - gray if negate else gray).save(tmp_path / "home.pgm")
     (tmp_path / "home.yaml").write_text(
         f"{ROS}free_thresh: {free_thresh}\nnegate: {negate}\nmode: {mode}\n"
     )
@@ -257,7 +257,7 @@ def test_ros_map(tmp_path, free_thresh, negate, mode):
 def test_transparent_pixels_of_a_ros_map_are_unknown(tmp_path):
     from PIL import Image
 
-    pixels = np.full((40, 60, 2), 255, np.uint8)  # grey and alpha
+    pixels = np.full((40, 60, 2), 255, np.uint8)  # gray and alpha
     pixels[10, 20, 1] = 0
     Image.fromarray(pixels, "LA").save(tmp_path / "home.png")
     (tmp_path / "home.yaml").write_text(ROS.replace("pgm", "png"))

@@ -109,7 +109,7 @@ def _attempt(**changes):
 
 
 @pytest.mark.parametrize(
-    ("changes", "judged", "cause"),
+    ("changes", "max_scored", "cause"),
     [
         ({"matched": False}, {}, "no match found"),
         ({}, {}, "matched the wrong pose"),
@@ -120,9 +120,9 @@ def _attempt(**changes):
         ({}, {"right": True, "valid": False}, "invalid path"),
     ],
 )
-def test_causes(changes, judged, cause):
-    judged = {"right": False, "valid": True, "alike": False, "known": True} | judged
-    assert methods._cause(_attempt(**changes), **judged) == cause
+def test_causes(changes, max_scored, cause):
+    max_scored = {"right": False, "valid": True, "alike": False, "known": True} | max_scored
+    assert methods._cause(_attempt(**changes), **max_scored) == cause
     assert cause in methods.CAUSES
 
 
@@ -183,7 +183,7 @@ def test_summary():
         "straight_is_blocked": False,
     }
     lost = {**row, "success": False, "cause": "no match found", "time_s": 3.0}
-    summary = runner.summarise([row, lost, {**row, "level": 1.0}])
+    summary = runner.summarize([row, lost, {**row, "level": 1.0}])
     assert summary["average_success"] == pytest.approx(0.75)
     level = summary["levels"][0]
     assert (level["n"], level["success"], level["median_time_s"]) == (2, 0.5, 2.0)
@@ -207,7 +207,7 @@ def test_page_has_tables_and_figures(tmp_path):
     runner.run(_benchmark(), file)
     page = tables.write_page([file], tmp_path)
     text = page.read_text()
-    assert "19.3" in text and "RTX 4090" in text  # the paper's, labelled
+    assert "19.3" in text and "RTX 4090" in text  # the paper's, labeled
     assert "--method dr-robot" in text
     assert (tmp_path / "visual_panda.png").stat().st_size > 10_000
     with pytest.raises(ValueError, match="no results file"):
@@ -249,7 +249,7 @@ def test_dr_robot_is_a_plain_adam_chain(near_task):
 
 def test_rrt_star_arrives_where_joints_wrap():
     robot, world = tasks.bench_robot("fetch"), tasks.bench_world("fetch", "")
-    joint = int(np.flatnonzero(robot.wraps)[-1])
+    joint = int(np.flatnonzero(robot.is_continuous)[-1])
     path = np.stack([robot.home, robot.home]).astype(np.float32)
     path[:, joint] = 3.0, -3.0
     estimate = baselines.BaselineResult(

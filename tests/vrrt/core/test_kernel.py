@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 import vrrt_jax
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import difference, free_steps, normalise, steer
+from vrrt_jax.core.edges import difference, free_steps, normalize, steer
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.planners.rrt import RRT, tree_path
 from vrrt_jax.core.planners.rrt_connect import RRTConnect, connection_path
 from vrrt_jax.core.rewire import with_costs
-from vrrt_jax.core.search import Stopped, make_stop, search
+from vrrt_jax.core.search import StopReason, make_termination, search
 from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import Proposals, Rejection, pytree
 
@@ -140,11 +140,11 @@ def test_steering_respects_limits_length_and_wrapping(panda, wall_world):
     step = steer(wall_world, q, far, jnp.float32(0.3))
     assert float(jnp.linalg.norm(step)) == pytest.approx(0.3, abs=1e-5)
     assert np.all(np.asarray(q + steer(wall_world, q, far, jnp.float32(1e3))) <= panda.upper + 1e-5)
-    turning = dataclasses.replace(wall_world, wraps=jnp.ones(7, bool))
+    turning = dataclasses.replace(wall_world, is_continuous=jnp.ones(7, bool))
     across = difference(turning, jnp.full(7, 3.0), jnp.full(7, -3.0))
     np.testing.assert_allclose(across, 2 * np.pi - 6.0, atol=1e-5)
-    np.testing.assert_allclose(normalise(turning, jnp.full(7, 3.3)), 3.3 - 2 * np.pi, atol=1e-5)
-    np.testing.assert_allclose(normalise(wall_world, jnp.full(7, 3.3)), 3.3)
+    np.testing.assert_allclose(normalize(turning, jnp.full(7, 3.3)), 3.3 - 2 * np.pi, atol=1e-5)
+    np.testing.assert_allclose(normalize(wall_world, jnp.full(7, 3.3)), 3.3)
 
 
 def test_free_steps_counts_the_leading_free_ones(wall_world, free):
@@ -165,7 +165,7 @@ def connect(world, seed, **stop):
         policy,
         tree,
         key=jax.random.key(seed),
-        stop=make_stop(0.0, **{"max_iterations": 200, **stop}),
+        stop=make_termination(0.0, **{"max_iterations": 200, **stop}),
     )
 
 
@@ -185,7 +185,7 @@ def assert_free(world, free, path):
 
 
 def test_rrt_connect_goes_around_the_wall(wall_world, free, connected):
-    assert connected.stopped is Stopped.REACHED
+    assert connected.stopped is StopReason.REACHED
     path = connection_path(connected.tree)
     np.testing.assert_allclose(path[[0, -1]], [START, GOAL], atol=1e-5)
     assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() <= 32 * 0.02 + 1e-4
@@ -222,10 +222,10 @@ def test_interrupt_keeps_the_tree(wall_world, monkeypatch):
         policy,
         tree,
         key=jax.random.key(0),
-        stop=make_stop(-1.0, max_iterations=10_000),
+        stop=make_termination(-1.0, max_iterations=10_000),
         on_progress=lambda state, seconds: signal.raise_signal(signal.SIGINT),
     )
-    assert found.stopped is Stopped.INTERRUPTED and int(found.tree.size) > 1
+    assert found.stopped is StopReason.INTERRUPTED and int(found.tree.size) > 1
 
 
 def test_budget_capacity_and_time_are_reported(wall_world):
@@ -234,17 +234,17 @@ def test_budget_capacity_and_time_are_reported(wall_world):
 
     def run(capacity, limit=float("inf"), **stop):
         tree = trees.create(jnp.asarray(START)[None], score[None], None, capacity)
-        rule = make_stop(-1.0, **{"max_iterations": 10_000, **stop})
+        rule = make_termination(-1.0, **{"max_iterations": 10_000, **stop})
         key = jax.random.key(0)
         return search(wall_world, policy, tree, key=key, stop=rule, time_limit_s=limit)
 
     full = run(100)
-    assert full.stopped is Stopped.TREE_FULL and int(full.tree.size) == 100
+    assert full.stopped is StopReason.TREE_FULL and int(full.tree.size) == 100
     assert int(full.tree.rejected[Rejection.CAPACITY]) > 0
     few = run(4096, max_iterations=3)
-    assert few.stopped is Stopped.ITERATIONS and int(few.tree.iteration) == 3
-    assert run(4096, limit=0.0).stopped is Stopped.TIME_LIMIT
-    assert run(4096, patience=5, min_improvement=1e9).stopped is Stopped.CONVERGED
+    assert few.stopped is StopReason.ITERATIONS and int(few.tree.iteration) == 3
+    assert run(4096, limit=0.0).stopped is StopReason.TIME_LIMIT
+    assert run(4096, patience=5, min_improvement=1e9).stopped is StopReason.CONVERGED
 
 
 def test_rrt_star_improves_on_rrt_with_right_costs(wall_world, free):
@@ -257,7 +257,7 @@ def test_rrt_star_improves_on_rrt_with_right_costs(wall_world, free):
         )
         score, _ = policy.root(wall_world, jnp.asarray(START))
         tree = trees.create(jnp.asarray(START)[None], score[None], None, 8192)
-        stop = make_stop(-1.0, max_iterations=100)
+        stop = make_termination(-1.0, max_iterations=100)
         return search(wall_world, policy, tree, key=jax.random.key(3), stop=stop).tree
 
     plain, star = run(False), run(True)

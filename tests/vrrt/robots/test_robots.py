@@ -125,13 +125,16 @@ def random_q(robot, num, seed=0):
 def test_panda_is_a_panda(panda):
     assert panda.joint_names == tuple(f"joint{k}" for k in range(1, 8))
     assert panda.link_names == tuple(f"link{k}" for k in range(8))
-    assert not panda.wraps.any()
+    assert not panda.is_continuous.any()
     np.testing.assert_allclose(panda.lower[[0, 3]], [-2.8973, -3.0718])
     np.testing.assert_allclose(panda.upper[[0, 3]], [2.8973, -0.0698])
     assert np.all((panda.lower < panda.home) & (panda.home < panda.upper))
-    assert len(panda.cover_bodies) == len(panda.cover.radius) <= 45
-    assert "link0" not in panda.cover_bodies and "link0" in panda.thin_bodies
-    assert {"left_finger", "hand", "link1"} <= set(panda.cover_bodies)
+    assert len(panda.collision_sphere_bodies) == len(panda.cover.radius) <= 45
+    assert (
+        "link0" not in panda.collision_sphere_bodies
+        and "link0" in panda.self_collision_sphere_bodies
+    )
+    assert {"left_finger", "hand", "link1"} <= set(panda.collision_sphere_bodies)
 
 
 def test_panda_kinematics_is_that_of_its_file(panda):
@@ -237,8 +240,8 @@ def test_pairs_are_those_of_c_mujoco(panda):
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
-        centre = data.geom_xpos[thin]
-        apart = np.linalg.norm(centre[first] - centre[second], axis=1)
+        center = data.geom_xpos[thin]
+        apart = np.linalg.norm(center[first] - center[second], axis=1)
         touching = {
             (int(thin[a]), int(thin[b]))
             for a, b in panda.pairs[apart < radius[first] + radius[second]]
@@ -253,12 +256,12 @@ def test_every_kind_of_geom_and_joint(tmp_path):
     path = write(tmp_path, ARM)
     robot = load_robot(path)
     assert robot.joint_names == ("turn", "bend", "roll", "reach")
-    assert robot.wraps.tolist() == [False, True, False, False]
+    assert robot.is_continuous.tolist() == [False, True, False, False]
     np.testing.assert_allclose(robot.lower, [np.radians(-100), -np.pi, np.radians(-90), 0])
     np.testing.assert_allclose(robot.home, [0.5, 1.2, 0.2, 0.1])
-    assert set(robot.cover_bodies) == {"upper", "fore", "rod"}
-    assert set(robot.thin_bodies) == {"base", "upper", "fore", "rod"}
-    assert len(robot.pairs) > 0
+    assert set(robot.collision_sphere_bodies) == {"upper", "fore", "rod"}
+    assert set(robot.self_collision_sphere_bodies) == {"base", "upper", "fore", "rod"}
+    assert len(robot.self_collision_pairs) > 0
     q = random_q(robot, 20)
     truth = body_positions(mujoco.MjModel.from_xml_path(str(path)), ["upper", "fore", "rod"], q)
     np.testing.assert_allclose(chain_positions(robot, q)[:, [0, 2, 3]], truth, atol=1e-5)
@@ -280,19 +283,19 @@ def test_urdf(tmp_path):
     robot = load_robot(write(tmp_path, URDF, "two.urdf"), freeze={"grip": 0.0})
     assert robot.joint_names == ("shoulder", "wrist")
     assert robot.link_names == ("base", "arm", "tip")
-    assert robot.wraps.tolist() == [False, True]
+    assert robot.is_continuous.tolist() == [False, True]
     np.testing.assert_allclose(robot.upper, [1.5, np.pi])
-    assert ("base", "arm") in robot.allowed
-    assert set(robot.cover_bodies) == {"arm", "tip"}
+    assert ("base", "arm") in robot.ignored_pairs
+    assert set(robot.collision_sphere_bodies) == {"arm", "tip"}
 
 
 def test_spheres_are_used_as_they_are(tmp_path):
     robot = load_robot(write(tmp_path, BALLS))
-    assert robot.cover_bodies == robot.thin_bodies == ("a", "b", "b")
-    np.testing.assert_allclose(robot.cover.radius, [0.1, 0.05, 0.04])
-    np.testing.assert_allclose(robot.cover.centre[:, 0], [0.2, 0.1, 0.2], atol=1e-7)
-    assert robot.cover.link.tolist() == [1, 2, 2]
-    assert len(robot.pairs) == 0
+    assert robot.collision_sphere_bodies == robot.self_collision_sphere_bodies == ("a", "b", "b")
+    np.testing.assert_allclose(robot.collision_spheres.radius, [0.1, 0.05, 0.04])
+    np.testing.assert_allclose(robot.collision_spheres.center[:, 0], [0.2, 0.1, 0.2], atol=1e-7)
+    assert robot.collision_spheres.link.tolist() == [1, 2, 2]
+    assert len(robot.self_collision_pairs) == 0
 
 
 def test_written_model_loads_as_the_same_robot(tmp_path):
@@ -300,9 +303,9 @@ def test_written_model_loads_as_the_same_robot(tmp_path):
     again = load_robot(write(tmp_path, robot.xml, "again.xml"))
     assert again.xml == robot.xml and again.name == "arm"  # whose self-model it may use
     assert again.mesh_source == robot.mesh_source and again.frozen == {"turn": 0.1}
-    np.testing.assert_array_equal(again.cover.radius, robot.cover.radius)
-    np.testing.assert_array_equal(again.pairs, robot.pairs)
-    assert again.allowed == robot.allowed
+    np.testing.assert_array_equal(again.cover.radius, robot.collision_spheres.radius)
+    np.testing.assert_array_equal(again.pairs, robot.self_collision_pairs)
+    assert again.allowed == robot.ignored_pairs
 
 
 def test_bodies_with_several_joints_belong_to_the_last(tmp_path):

@@ -1,4 +1,4 @@
-"""Spheres contain what they stand for, and do not claim much more."""
+"""Spheres contain what they stand for, and do not claim_output_dir much more."""
 
 import dataclasses
 
@@ -65,7 +65,7 @@ def uncovered(model, bodies, robot, rng):
             continue
         mine = found.body == own.body(model.body(body).name).id
         surface = convex_parts.surface_samples(shape, 0.002, rng)
-        gap = np.linalg.norm(surface[:, None] - found.centre[mine], axis=-1) - found.radius[mine]
+        gap = np.linalg.norm(surface[:, None] - found.center[mine], axis=-1) - found.radius[mine]
         worst = max(worst, gap.min(1).max())
     return worst
 
@@ -111,8 +111,8 @@ def test_fit_spheres_writes_a_robot(arm, tmp_path, monkeypatch, rng):
     path = tmp_path / "fitted.xml"
     path.write_text(xml)
     robot = load_robot(path)
-    assert len(robot.cover_bodies) == 5
-    assert sum(body == "base" for body in robot.thin_bodies) <= 2
+    assert len(robot.collision_sphere_bodies) == 5
+    assert sum(body == "base" for body in robot.self_collision_sphere_bodies) <= 2
     assert robot.mesh_source == arm.mesh_source
     model = true_model(arm)
     assert uncovered(model, [2, 3], robot, rng) <= 1e-9
@@ -166,11 +166,11 @@ def test_grow_takes_the_worst_point_in_by_the_nearest_sphere():
 def test_contain_surface_closes_every_gap(rng):
     """Two balls in a box, far too small: they grow until the box is inside."""
     box = convex_parts.piece_of(rng.uniform(-0.1, 0.1, (60, 3)))
-    centres, radii = convex_parts.contain_surface(
+    centers, radii = convex_parts.contain_surface(
         [box], np.array([[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0]]), np.full(2, 0.05), leaf=1e-3
     )
     surface = convex_parts.surface_samples([box], 0.001, rng)
-    gap = np.linalg.norm(surface[:, None] - centres, axis=-1) - radii
+    gap = np.linalg.norm(surface[:, None] - centers, axis=-1) - radii
     assert gap.min(1).max() <= 0
     assert radii.max() < 0.2
 
@@ -185,8 +185,8 @@ def test_descent_beats_its_starts(rng):
     samples = cover.sample_bodies(model, {1: [bar]}, rng)[1]
     _, _, alarms = cover.fit_body(samples, 3, rng)
     # no three spheres of one radius on the axis do better than sqrt(0.05^2 + 2 * 0.04^2)
-    centres = np.array([[-0.1, 0, 0], [0, 0, 0], [0.1, 0, 0]])
-    gap = np.linalg.norm(samples.outside[:, None] - centres, axis=-1) - np.sqrt(0.0057)
+    centers = np.array([[-0.1, 0, 0], [0, 0, 0], [0.1, 0, 0]])
+    gap = np.linalg.norm(samples.outside[:, None] - centers, axis=-1) - np.sqrt(0.0057)
     assert alarms < 1.05 * np.sum(gap.min(1) < samples.ball) * samples.cell
 
 

@@ -92,7 +92,7 @@ def test_a_small_self_model_is_trained_and_resumed(arm, tmp_path, monkeypatch):
     assert len(restored) == 1 and not rendered  # the level and the images that were done
     assert not path.with_name("arm.npz.work").exists()
     assert model.levels[0].psnr_db > 22 and model.close_up.psnr_db > 18
-    assert load_self_model(path).close_up.match_bar == model.close_up.match_bar
+    assert load_self_model(path).close_up.match_threshold == model.close_up.match_threshold
 
 
 def test_close_ups_show_the_outermost_link(arm):

@@ -95,7 +95,7 @@ def broken(image, what):
         return image[:, :70]
     if what == "channels":
         return image[..., :2]
-    if what == "grey":
+    if what == "gray":
         return image[..., 0]
     if what == "nan":
         image[3, 3, 1] = np.nan
@@ -115,7 +115,7 @@ def broken(image, what):
     [
         ("size", r"70x60 px but its camera makes 80x60 px"),
         ("channels", r"shape \(60, 80, 2\); expected \(height, width, 3\)"),
-        ("grey", r"shape \(60, 80\)"),
+        ("gray", r"shape \(60, 80\)"),
         ("nan", "1 values that are NaN"),
         ("range", r"expected floats in \[0, 1\]"),
         ("mask", "mask .* is empty"),

@@ -28,7 +28,7 @@ def splats(mean, rgb=None, *, radius=0.02, density=2.0, tau=0.03, link=None):
         radius=jnp.broadcast_to(jnp.asarray(radius, mean.dtype), num),
         density=jnp.broadcast_to(jnp.asarray(density, mean.dtype), num),
         rgb=jnp.full((num, 3), 0.5, mean.dtype) if rgb is None else jnp.asarray(rgb, mean.dtype),
-        shade=jnp.full((num, 3), 0.1, mean.dtype),
+        view_color_gradient=jnp.full((num, 3), 0.1, mean.dtype),
         link=jnp.zeros(num, jnp.int32) if link is None else jnp.asarray(link),
         tau=jnp.asarray(tau, mean.dtype),
     )
@@ -101,7 +101,7 @@ def test_gradients_are_those_of_finite_differences(panda, rng, size):
         chain = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), panda.chain)
         camera = look_at((1.2, 1.0, 0.8), (0, 0, 0.4), height=size[0], width=size[1])
         weight = jnp.asarray(rng.normal(size=(*size, 4)))
-        names = ("mean", "radius", "density", "rgb", "shade", "tau")
+        names = ("mean", "radius", "density", "rgb", "view_color_gradient", "tau")
 
         @jax.jit
         def loss(x):
@@ -154,11 +154,11 @@ def test_a_splat_behind_the_camera_changes_nothing():
 
 @pytest.mark.parametrize("windows", [None, Windows(cluster=1, px=24)])
 def test_far_splats_keep_their_colour(windows):
-    """Four metres behind the nearest, at the smallest tau: exp(-133) is zero in float32."""
+    """Four meters behind the nearest, at the smallest tau: exp(-133) is zero in float32."""
     model = splats(
         [[1.0, 0.25, 0.0], [5.0, -1.25, 0.0]], [[1, 0, 0], [0, 1, 0]], radius=(0.03, 0.15)
     )
-    model = dataclasses.replace(model, shade=jnp.zeros((2, 3)))
+    model = dataclasses.replace(model, view_color_gradient=jnp.zeros((2, 3)))
 
     @jax.jit
     @jax.grad
@@ -222,7 +222,7 @@ def test_clusters_that_fit_and_others_mix(rng):
 
 
 def test_a_near_splat_tints_far_ones_outside_a_narrow_window_too():
-    """Four standard deviations from its centre it still outweighs what is half a metre behind."""
+    """Four standard deviations from its center it still outweighs what is half a meter behind."""
     model = splats([[1.0, 0.0, 0.0], [1.5, 0.16, 0.0]], [[1, 0, 0], [0, 1, 0]], radius=(0.02, 0.05))
     whole, cut = (
         jax.jit(lambda p, w=w: render(model, p, ahead(), w)[0])(jnp.eye(4)[None])
@@ -234,9 +234,11 @@ def test_a_near_splat_tints_far_ones_outside_a_narrow_window_too():
 
 
 def test_a_layer_hides_another_only_as_far_as_it_covers():
-    """Where the near splat is faint the far one keeps its colour, and behind it none is left."""
+    """Where the near splat is faint the far one keeps its color, and behind it none is left."""
     model = splats([[1.0, 0.0, 0.0], [1.5, 0.0, 0.0]], [[1, 0, 0], [0, 1, 0]], radius=(0.02, 0.09))
-    model = dataclasses.replace(model, density=jnp.array([9.0, 3.0]), shade=jnp.zeros((2, 3)))
+    model = dataclasses.replace(
+        model, density=jnp.array([9.0, 3.0]), view_color_gradient=jnp.zeros((2, 3))
+    )
 
     def image(model):
         rgb, coverage = jax.jit(lambda p: render(model, p, ahead()))(jnp.eye(4)[None])

@@ -101,7 +101,7 @@ def test_balls_are_the_same_as_isotropic_splats_on_the_optical_axis():
         radius=balls.scale[:, 0],
         density=balls.density,
         rgb=balls.rgb,
-        shade=jnp.zeros((2, 3)),
+        view_color_gradient=jnp.zeros((2, 3)),
         link=jnp.zeros(2, jnp.int32),
         tau=jnp.float32(0.03),
     )
@@ -174,7 +174,9 @@ def test_the_fast_rasterizer_has_the_same_colours_where_splats_do_not_overlap():
         radius=jnp.array([0.02, 0.03, 0.025, 0.02]),
         density=jnp.array([0.5, 1.0, 2.0, 4.0]),
         rgb=jnp.array([[0.9, 0.1, 0.3], [0.2, 0.8, 0.4], [0.1, 0.3, 0.9], [0.6, 0.5, 0.2]]),
-        shade=jnp.array([[0.3, -0.2, 0.1], [-0.4, 0.2, 0.3], [0.2, 0.5, 0.0], [0.1, -0.3, 0.4]]),
+        view_color_gradient=jnp.array(
+            [[0.3, -0.2, 0.1], [-0.4, 0.2, 0.3], [0.2, 0.5, 0.0], [0.1, -0.3, 0.4]]
+        ),
         link=jnp.array([0, 0, 1, 1]),
         tau=jnp.float32(0.03),
     )
@@ -192,7 +194,7 @@ def test_soft_occlusion_becomes_true_occlusion_of_dense_splats():
         radius=jnp.array([0.1, 0.1]),
         density=jnp.array([20.0, 20.0]),
         rgb=jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
-        shade=jnp.zeros((2, 3)),
+        view_color_gradient=jnp.zeros((2, 3)),
         link=jnp.zeros(2, jnp.int32),
         tau=jnp.float32(0.03),
     )

@@ -356,7 +356,7 @@ def _hand_position(panda, q):
 def finished(tree):
     return searches.SearchResult(
         tree=tree,
-        stopped=searches.Stopped.REACHED,
+        stopped=searches.StopReason.REACHED,
         history=np.zeros((1, 4)),
         compile_s=0.0,
         search_s=0.0,

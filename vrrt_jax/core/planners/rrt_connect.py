@@ -88,7 +88,7 @@ class RRTConnect:
 
     def evaluate(self, world: Space, q: jax.Array, proposals: Proposals):
         """0 for children that arrived; the way left, or a large number, for the others."""
-        connects, nearest, target, side = proposals.carry
+        connects, nearest, target, side = proposals.aux
         left = distance(world, q, target)
         arrived = connects & (left < SAME)
         score = jnp.where(connects, jnp.where(arrived, 0.0, left), 1e6)
@@ -107,9 +107,9 @@ class RRTConnect:
         expansion: Expansion,
     ) -> Tree[ConnectNode]:
         """A node has had its try; a child that ran into something while connecting has too."""
-        connects = proposals.carry[0]
+        connects = proposals.aux[0]
         tried = jnp.where(connects, proposals.parent, tree.capacity)
-        stuck = jnp.where(connects & expansion.blocked, expansion.slot, tree.capacity)
+        stuck = jnp.where(connects & expansion.blocked, expansion.node_index, tree.capacity)
         fresh = tree.payload.fresh.at[tried].set(False, mode="drop")
         fresh = fresh.at[stuck].set(False, mode="drop")
         return dataclasses.replace(tree, payload=dataclasses.replace(tree.payload, fresh=fresh))
