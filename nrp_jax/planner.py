@@ -35,7 +35,7 @@ class Status(enum.Enum):
     """How a plan ended, with what to try next."""
 
     SOLVED = "a path to the goal, checked with C MuJoCo"
-    BUDGET = "the expansions ran out: raise max_expansions"
+    MAX_ITERATIONS = "the expansions ran out: raise max_expansions"
     TREE_FULL = "the tree is full: raise capacity"
     TIME_LIMIT = "the time limit passed: raise time_limit_s"
     INTERRUPTED = "interrupted"

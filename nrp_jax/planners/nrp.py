@@ -32,7 +32,7 @@ class RRT:
         """Extend the nearest nodes towards random configurations, or the goal."""
         parent, aim, _ = self.aims(world, tree, key)
         everywhere = jnp.ones(self.lanes, bool)
-        return Proposals(parent=parent, target=aim, ok=everywhere, partial=everywhere, carry=None)
+        return Proposals(parent=parent, target=aim, valid=everywhere, partial=everywhere, aux=None)
 
     def evaluate(self, world: GridWorld, q: jax.Array, proposals: Proposals):
         """Distances (B,) to the goal."""
@@ -104,9 +104,9 @@ class NeuralRRT(RRT):
         return Proposals(
             parent=parent,
             target=jnp.where(straight[:, None], aim, waypoint),
-            ok=jnp.ones(self.lanes, bool),
+            valid=jnp.ones(self.lanes, bool),
             partial=jnp.ones(self.lanes, bool),
-            carry=(aim, straight),
+            aux=(aim, straight),
         )
 
     def after_insert(

@@ -47,8 +47,10 @@ class MobileRobot:
     lower: jax.Array  # (A,) [rad] or [m]
     upper: jax.Array  # (A,) [rad] or [m]
     is_continuous: jax.Array  # (D,) bool, joints that turn for ever
-    cover: Spheres  # cover the robot but for its footprint: checked against obstacles
-    pairs: jax.Array  # (P, 2) i32 indices into ``cover``: which are checked against each other
+    collision_spheres: Spheres  # cover the robot but for its footprint: checked against obstacles
+    self_collision_pairs: (
+        jax.Array
+    )  # (P, 2) i32 indices into ``cover``: which are checked against each other
     plates: PlanarBoxes | None  # checked against each other instead, if there are any
     footprint: Footprint | None
     feature_link: jax.Array  # (F,) i32
@@ -123,8 +125,10 @@ def load_robot(name: str) -> MobileRobot:
         lower=jnp.asarray(lower, jnp.float32),
         upper=jnp.asarray(upper, jnp.float32),
         is_continuous=jnp.asarray(~limited & angular),
-        cover=cover,
-        pairs=jnp.asarray(_checked_pairs(model, owner[: 0 if planar else None]), jnp.int32),
+        collision_spheres=cover,
+        self_collision_pairs=jnp.asarray(
+            _checked_pairs(model, owner[: 0 if planar else None]), jnp.int32
+        ),
         plates=_plates(model, body_link, body_in_link) if planar else None,
         footprint=_footprint(model, body_link) if is_footprint.any() else None,
         feature_link=jnp.asarray(body_link[model.site_bodyid], jnp.int32),

@@ -40,11 +40,13 @@ class GridWorld(StraightLineEdges):
     """
 
     chain: Chain
-    cover: jax.Array  # (L * 12, 3 n) placement of the covering spheres
+    collision_spheres: jax.Array  # (L * 12, 3 n) placement of the covering spheres
     collision_radius: jax.Array  # (n,) [m]
     floor: jax.Array  # (n,) lowest height of their centers, -inf if they may touch the floor [m]
     plates: PlanarBoxes | None  # checked against each other instead
-    reach: jax.Array  # (m, n) at which the last m touch others, 0 for pairs not checked [m]
+    contact_distance: (
+        jax.Array
+    )  # (m, n) at which the last m touch others, 0 for pairs not checked [m]
     base: RoundBase | None
     field: DistanceField
     lower: jax.Array  # (D,)
@@ -244,7 +246,7 @@ def build_world(
         robot: from :func:`nrp_jax.load_robot`.
         grid: from :func:`nrp_jax.load_map` or a generator; the snake sees its planar map.
         wrap: joints without limits turn the short way round; otherwise they are intervals, as in
-            the paper. A heading always is_continuous.
+            the paper. A heading always wraps.
         resolution: longest sub-step of any joint between two collision checks [m] or [rad]; the
             paper's by default.
         arm_weight: meters that a radian of the arm counts for in the metric; the paper's by
@@ -271,11 +273,11 @@ def build_world(
     corner = np.array(grid.origin[:2])
     fields = {
         "chain": robot.chain,
-        "cover": _placement(robot.collision_spheres, robot.chain),
+        "collision_spheres": _placement(robot.collision_spheres, robot.chain),
         "collision_radius": robot.collision_spheres.radius,
         "floor": jnp.asarray(floor, jnp.float32),
         "plates": robot.plates,
-        "reach": jnp.asarray(_reach(robot)),
+        "contact_distance": jnp.asarray(_reach(robot)),
         "base": _round_base(robot, grid),
         "field": make_field(grid),
         "lower": _float(np.concatenate([corner, np.negative(turn), robot.lower])),

@@ -50,7 +50,7 @@ def iteration_split(problem: Problem, repeats: int = 15) -> dict:
     size = tree.size - policy.lanes
     expansion = Expansion(
         q=tree.q[size + jnp.arange(policy.lanes)],
-        slot=(size + jnp.arange(policy.lanes)).astype(jnp.int32),
+        node_index=(size + jnp.arange(policy.lanes)).astype(jnp.int32),
         accepted=jnp.ones(policy.lanes, bool),
         blocked=jnp.zeros(policy.lanes, bool),
     )

@@ -69,5 +69,7 @@ def expand(
     tree = dataclasses.replace(
         tree, iteration=tree_before.iteration + 1, rejected=tree_before.rejected + rejected
     )
-    expansion = Expansion(q=q, slot=slot, accepted=accepted, blocked=passed < policy.edge_steps)
+    expansion = Expansion(
+        q=q, node_index=slot, accepted=accepted, blocked=passed < policy.edge_steps
+    )
     return policy.after_insert(world, tree, proposals, expansion)

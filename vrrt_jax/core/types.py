@@ -80,9 +80,9 @@ class Proposals:
 
     parent: jax.Array  # (B,) i32 node to expand
     target: jax.Array  # (B, D) where to go; the kernel clips it to limits and edge length
-    ok: jax.Array  # (B,) bool, False where the lane has nothing to try
+    valid: jax.Array  # (B,) bool, False where the lane has nothing to try
     partial: jax.Array  # (B,) bool, keep the free part of a blocked edge
-    carry: Any  # leaves (B, ...): handed to ``evaluate`` and ``after_insert``
+    aux: Any  # leaves (B, ...): handed to ``evaluate`` and ``after_insert``
 
 
 @pytree
@@ -90,7 +90,7 @@ class Expansion:
     """What became of one iteration's lanes, for ``after_insert``."""
 
     q: jax.Array  # (B, D) the children
-    slot: jax.Array  # (B,) i32 where each went, N (out of range) if rejected
+    node_index: jax.Array  # (B,) i32 where each went, N (out of range) if rejected
     accepted: jax.Array  # (B,) bool
     blocked: jax.Array  # (B,) bool, something lies on the edge
 
@@ -130,7 +130,7 @@ class Status(enum.Enum):
         "matched, but no way there was found: raise connect_iterations and capacity, or move the "
         "obstacles"
     )
-    BUDGET = "the iterations ran out: raise max_iterations"
+    MAX_ITERATIONS = "the iterations ran out: raise max_iterations"
     TREE_FULL = "the tree is full: raise capacity"
     TIME_LIMIT = "the time limit passed: raise time_limit_s"
     INTERRUPTED = "interrupted: the best path so far is returned"

@@ -33,12 +33,20 @@ class Robot:
     upper: np.ndarray  # (D,) [rad] or [m]; pi for an unlimited hinge
     is_continuous: np.ndarray  # (D,) bool, an unlimited hinge: q and q + 2 pi are the same
     home: np.ndarray  # (D,) a free configuration [rad] or [m]
-    cover: Spheres  # cover the moving links: checked against obstacles
-    collision_sphere_bodies: tuple[str, ...]  # body of each sphere of ``cover``, for messages
-    thin: Spheres  # follow the surface of all links, the base too: checked against each other
-    self_collision_sphere_bodies: tuple[str, ...]  # body of each sphere of ``thin``, for messages
-    pairs: np.ndarray  # (P, 2) i32 indices into ``thin``: which are checked against each other
-    allowed: tuple[tuple[str, str], ...]  # pairs of bodies that are never checked
+    collision_spheres: Spheres  # cover the moving links: checked against obstacles
+    collision_sphere_bodies: tuple[
+        str, ...
+    ]  # body of each sphere of ``collision_spheres``, for messages
+    self_collision_spheres: (
+        Spheres  # follow the surface of all links, the base too: checked against each other
+    )
+    self_collision_sphere_bodies: tuple[
+        str, ...
+    ]  # body of each sphere of ``self_collision_spheres``, for messages
+    self_collision_pairs: (
+        np.ndarray
+    )  # (P, 2) i32 indices into ``self_collision_spheres``: which are checked against each other
+    ignored_pairs: tuple[tuple[str, str], ...]  # pairs of bodies that are never checked
     frozen: Mapping[str, float]  # joints of the true geometry that are fixed [rad] or [m]
     xml: str  # the collision model as MJCF; compiles by itself, without any mesh
     mesh_source: str | None  # name or file of the true geometry, see ``sources.mesh_spec``
@@ -100,7 +108,7 @@ def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None =
         allowed += always
     xml = write(thin=thin_spheres, allowed=allowed)
     return _robot(
-        model=mujoco.MjModel.from_xml_string(xml), allowed=tuple(allowed), xml=xml, **fields
+        model=mujoco.MjModel.from_xml_string(xml), ignored_pairs=tuple(allowed), xml=xml, **fields
     )
 
 
@@ -138,11 +146,14 @@ def _robot(*, model: mujoco.MjModel, **fields) -> Robot:
     chain, body_link, body_in_link = chain_from_model(model)
     lower, upper = mjcf.joint_ranges(model)
     labels = {}
-    for label, group in (("cover", mjcf_writer.COVER), ("thin", mjcf_writer.THIN)):
+    for label, group in (
+        ("collision_sphere", mjcf_writer.COVER),
+        ("self_collision_sphere", mjcf_writer.THIN),
+    ):
         geoms = np.flatnonzero(model.geom_group == int(group["group"]))
         bodies = model.geom_bodyid[geoms]
         center = np.einsum("nij,nj->ni", body_in_link[bodies, :3, :3], model.geom_pos[geoms])
-        labels[label] = Spheres(
+        labels[f"{label}s"] = Spheres(
             link=jnp.asarray(body_link[bodies], jnp.int32),
             center=jnp.asarray(center + body_in_link[bodies, :3, 3], jnp.float32),
             radius=jnp.asarray(model.geom_size[geoms, 0], jnp.float32),
@@ -158,7 +169,7 @@ def _robot(*, model: mujoco.MjModel, **fields) -> Robot:
         upper=upper,
         is_continuous=model.jnt_limited == 0,
         home=model.key_qpos[0].copy(),
-        pairs=pairs.checked_pairs(model),
+        self_collision_pairs=pairs.checked_pairs(model),
         **labels,
         **fields,
     )

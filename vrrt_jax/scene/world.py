@@ -32,10 +32,16 @@ class World(StraightLineEdges):
     """All that planners ask about robot and obstacles."""
 
     chain: Chain
-    cover: jax.Array  # (L * 12, 3 n) placement of the covering spheres, against obstacles
+    collision_spheres: (
+        jax.Array
+    )  # (L * 12, 3 n) placement of the covering spheres, against obstacles
     collision_radius: jax.Array  # (n,) [m]
-    thin: jax.Array  # (L * 12, 3 m) placement of the thinner spheres, against each other
-    reach: jax.Array  # (m, m) distance at which two of them touch, 0 for pairs not checked [m]
+    self_collision_spheres: (
+        jax.Array
+    )  # (L * 12, 3 m) placement of the thinner spheres, against each other
+    contact_distance: (
+        jax.Array
+    )  # (m, m) distance at which two of them touch, 0 for pairs not checked [m]
     obstacles: Obstacles
     lower: jax.Array  # (D,)
     upper: jax.Array  # (D,)
@@ -116,10 +122,10 @@ def build_world(
     num_slots = 8 * max(-(-num_slots // 8), -(-len(obstacles) // 8), 1)
     world = World(
         chain=robot.chain,
-        cover=_placement(robot.collision_spheres, robot.chain),
+        collision_spheres=_placement(robot.collision_spheres, robot.chain),
         collision_radius=robot.collision_spheres.radius,
-        thin=_placement(robot.self_collision_spheres, robot.chain),
-        reach=jnp.asarray(reach),
+        self_collision_spheres=_placement(robot.self_collision_spheres, robot.chain),
+        contact_distance=jnp.asarray(reach),
         obstacles=to_slots([], num_slots),
         lower=jnp.asarray(robot.lower, jnp.float32),
         upper=jnp.asarray(robot.upper, jnp.float32),
@@ -164,7 +170,7 @@ def with_obstacles(world: World, obstacles: Sequence[Obstacle]) -> World:
 def with_margin(world: World, margin: float) -> World:
     """The same world, where the robot keeps ``margin`` [m] farther from obstacles and itself."""
     reach = jnp.where(world.contact_distance > 0, world.contact_distance + margin, 0.0)
-    return dataclasses.replace(world, margin=world.margin + margin, reach=reach)
+    return dataclasses.replace(world, margin=world.margin + margin, contact_distance=reach)
 
 
 def obstacle_list(world: World) -> list[Obstacle]:

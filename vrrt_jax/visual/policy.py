@@ -111,9 +111,9 @@ class VisualPolicy:
         return Proposals(
             parent=parent,
             target=q + jnp.where(lanes, step, wander),
-            ok=jnp.ones(self.lanes, bool),
+            valid=jnp.ones(self.lanes, bool),
             partial=jnp.zeros(self.lanes, bool),
-            carry=(
+            aux=(
                 exploits,
                 jax.tree.map(
                     lambda a, b: jnp.where(exploits if a.ndim == 1 else lanes, a, b), adam, fresh

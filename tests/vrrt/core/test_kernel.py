@@ -38,9 +38,9 @@ class Scripted:
         return Proposals(
             parent=jnp.zeros(lanes, jnp.int32),
             target=self.target,
-            ok=self.ok,
+            valid=self.ok,
             partial=jnp.zeros(lanes, bool),
-            carry=None,
+            aux=None,
         )
 
     def evaluate(self, world, q, proposals):

@@ -129,7 +129,7 @@ def test_panda_is_a_panda(panda):
     np.testing.assert_allclose(panda.lower[[0, 3]], [-2.8973, -3.0718])
     np.testing.assert_allclose(panda.upper[[0, 3]], [2.8973, -0.0698])
     assert np.all((panda.lower < panda.home) & (panda.home < panda.upper))
-    assert len(panda.collision_sphere_bodies) == len(panda.cover.radius) <= 45
+    assert len(panda.collision_sphere_bodies) == len(panda.collision_spheres.radius) <= 45
     assert (
         "link0" not in panda.collision_sphere_bodies
         and "link0" in panda.self_collision_sphere_bodies
@@ -234,7 +234,7 @@ def test_pairs_are_those_of_c_mujoco(panda):
     data = mujoco.MjData(model)
     thin = np.flatnonzero(model.geom_group == 4)
     radius = model.geom_size[thin, 0]
-    first, second = panda.pairs.T
+    first, second = panda.self_collision_pairs.T
     colliding = 0
     for q in random_q(panda, 1000, seed=3):
         data.qpos[:] = q
@@ -244,7 +244,7 @@ def test_pairs_are_those_of_c_mujoco(panda):
         apart = np.linalg.norm(center[first] - center[second], axis=1)
         touching = {
             (int(thin[a]), int(thin[b]))
-            for a, b in panda.pairs[apart < radius[first] + radius[second]]
+            for a, b in panda.self_collision_pairs[apart < radius[first] + radius[second]]
         }
         theirs = data.contact.geom[data.contact.dist < 0]
         assert touching == {(min(pair), max(pair)) for pair in theirs.tolist()}
@@ -303,9 +303,9 @@ def test_written_model_loads_as_the_same_robot(tmp_path):
     again = load_robot(write(tmp_path, robot.xml, "again.xml"))
     assert again.xml == robot.xml and again.name == "arm"  # whose self-model it may use
     assert again.mesh_source == robot.mesh_source and again.frozen == {"turn": 0.1}
-    np.testing.assert_array_equal(again.cover.radius, robot.collision_spheres.radius)
-    np.testing.assert_array_equal(again.pairs, robot.self_collision_pairs)
-    assert again.allowed == robot.ignored_pairs
+    np.testing.assert_array_equal(again.collision_spheres.radius, robot.collision_spheres.radius)
+    np.testing.assert_array_equal(again.self_collision_pairs, robot.self_collision_pairs)
+    assert again.ignored_pairs == robot.ignored_pairs
 
 
 def test_bodies_with_several_joints_belong_to_the_last(tmp_path):

@@ -47,9 +47,9 @@ class RRT:
         return Proposals(
             parent=parent.astype(jnp.int32),
             target=target,
-            ok=everywhere,
+            valid=everywhere,
             partial=~everywhere,
-            carry=None,
+            aux=None,
         )
 
     def evaluate(self, world: Space, q: jax.Array, proposals: Proposals):

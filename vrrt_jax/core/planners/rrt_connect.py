@@ -76,9 +76,9 @@ class RRTConnect:
         return Proposals(
             parent=jnp.where(connects, chosen, nearest),
             target=jnp.where(connects[:, None], tree.q[nearest], aim),
-            ok=jnp.ones(self.lanes, bool),
+            valid=jnp.ones(self.lanes, bool),
             partial=jnp.ones(self.lanes, bool),
-            carry=(
+            aux=(
                 connects,
                 nearest,
                 tree.q[nearest],
