@@ -136,13 +136,13 @@ def _plan(arguments: argparse.Namespace) -> int:
 
     out = _writable(arguments.out)
     problem = _problem(arguments)
-    changes: dict[str, Any] = {"time_limit_s": arguments.time_limit}
+    changes: dict[str, Any] = {"budget.time_limit_s": arguments.time_limit}
     if arguments.capacity is not None:
-        changes["capacity"] = arguments.capacity
+        changes["tree.capacity"] = arguments.capacity
     make = vrrt_jax.PlannerConfig.paper if arguments.paper else vrrt_jax.PlannerConfig
-    config = make(**changes)
+    config = make().changed(changes)
     print(f"{problem.name}: {problem.robot.name}, seed {arguments.seed}; compiling ...", flush=True)
-    with tqdm(total=config.max_iterations, unit="it", disable=None, leave=False) as bar:
+    with tqdm(total=config.budget.max_iterations, unit="it", disable=None, leave=False) as bar:
 
         def on_progress(state, seconds):
             bar.n = int(state.tree.iteration)
@@ -152,9 +152,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         result = vrrt_jax.plan(
             problem.robot,
             problem.world,
-            problem.self_model,
-            problem.cameras,
-            problem.goal_images,
+            problem.goal,
             problem.q_start,
             key=jax.random.key(arguments.seed),
             config=config,
@@ -165,7 +163,7 @@ def _plan(arguments: argparse.Namespace) -> int:
     if not arguments.no_pictures:
         _pictures(problem, result, out)
     if not result.ok:
-        print(f"{result.status.name}: {result.status.value}", file=sys.stderr)
+        print(f"{result.status.name}: {result.status.value}; {result.advice}", file=sys.stderr)
     return EXIT_SOLVED if result.ok else EXIT_UNSOLVED
 
 

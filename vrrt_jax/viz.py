@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from vrrt_jax.core.edges import difference
-from vrrt_jax.planner import PlanResult
+from vrrt_jax.core.result import PlanResult
 from vrrt_jax.problems import Problem
 from vrrt_jax.robots import Robot
 from vrrt_jax.robots.kinematics import link_poses
@@ -230,7 +230,7 @@ def _draw_loss(axes, result: PlanResult) -> None:
     history = result.history
     axes.semilogy(history[:, 0], history[:, 2], color="tab:blue", label="best loss in the tree")
     axes.axhline(
-        result.search_goal_loss, color="tab:green", ls="--", lw=1, label="counts as matched"
+        result.search_match_threshold, color="tab:green", ls="--", lw=1, label="counts as matched"
     )
     axes.set_xlabel("iteration of the search")
     axes.set_ylabel("image loss")

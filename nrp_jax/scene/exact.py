@@ -4,26 +4,16 @@ Nothing here shares code with the distances and spheres that the planners comput
 there cannot hide itself.
 """
 
-import dataclasses
-
 import mujoco
 import numpy as np
 
 from nrp_jax.homes.grid import Grid
 from nrp_jax.scene.robots import MobileRobot
+from vrrt_jax.core.result import Verification
 
 STEP = 0.02  # [m] and [rad], how fine a trajectory must be
 _WALL = 1.0  # [m] thickness of what stands around the map
 _SLACK = 1e-6  # [m] deeper contacts count
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Verification:
-    """What :func:`verify` found."""
-
-    ok: bool
-    checked: int  # number of configurations
-    problem: str | None  # the first violation, such as "link3 touches the map at 37 %"
 
 
 class ExactScene:
@@ -85,8 +75,8 @@ def verify(
         if contact := problem or scene.touching(q):
             share = 100 * index / max(len(trajectory) - 1, 1)
             where = "" if problem else f" at {share:.0f} % of the path"
-            return Verification(ok=False, checked=index + 1, problem=contact + where)
-    return Verification(ok=True, checked=len(trajectory), problem=None)
+            return Verification(ok=False, checked=index + 1, contact=contact + where)
+    return Verification(ok=True, checked=len(trajectory), contact=None)
 
 
 def _motion_problem(

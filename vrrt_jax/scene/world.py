@@ -240,3 +240,8 @@ def move_obstacle(
 def _placement(spheres: Spheres, chain: Chain) -> jax.Array:
     matrix = placement(np.asarray(spheres.link), np.asarray(spheres.center), chain.num_links)
     return jnp.asarray(matrix)
+
+
+def overrides_is_free(world: World) -> bool:
+    """Whether a subclass has an ``is_free`` of its own, which the exact check does not know."""
+    return type(world).is_free is not World.is_free
