@@ -36,9 +36,9 @@ def run(
     splats, windows = choose_windows(whole, poses, camera)
 
     def loss(q, splats, draw, *options):
-        rgb, coverage = draw(splats, link_poses(robot.chain, q), camera, *options)
-        goal = jnp.full_like(coverage, 0.3)
-        return image_loss(rgb, coverage, goal[..., None], goal, jnp.ones_like(goal))
+        rgb, alpha = draw(splats, link_poses(robot.chain, q), camera, *options)
+        goal = jnp.full_like(alpha, 0.3)
+        return image_loss(rgb, alpha, goal[..., None], goal, jnp.ones_like(goal))
 
     def lanes(function, *options):
         return jax.jit(lambda q: map_lanes(lambda q: function(q, *options), q))

@@ -75,7 +75,7 @@ def iteration_split(problem: Problem, repeats: int = 15) -> dict:
     return {
         "lanes": policy.lanes,
         "num_splats": policy.splats.num_splats,
-        "image_px": list(policy.goal.coverage.shape[1:]),
+        "image_px": list(policy.goal.alpha.shape[1:]),
         "capacity": config.capacity,
         "tree_nodes": int(tree.size),
         **{f"{name}_ms": round(value, 2) for name, value in times.items()},

@@ -77,7 +77,7 @@ class Images:
     q: np.ndarray  # (n, D)
     cameras: Camera  # leading axis n
     rgb: np.ndarray  # (n, H, W, 3) float16
-    coverage: np.ndarray  # (n, H, W) float16
+    alpha: np.ndarray  # (n, H, W) float16
 
 
 def fit_self_model(robot, spec: mujoco.MjSpec, path: str | Path, *, seed: int, config: FitConfig):
@@ -235,19 +235,19 @@ def render_images(
             for each in zip(q, cameras, [tip] * num, off, strict=True)
         ]
     rgb = np.zeros((num, cameras[0].height, cameras[0].width, 3), np.float16)
-    coverage = np.zeros(rgb.shape[:3], np.float16)
+    alpha = np.zeros(rgb.shape[:3], np.float16)
     points = []
     for i in tqdm(range(num), desc="rendering", unit="image", leave=False):
         picture = renderer.picture(q[i], cameras[i])
-        rgb[i], coverage[i] = picture.rgb, picture.coverage
+        rgb[i], alpha[i] = picture.rgb, picture.alpha
         if i < num_surfaces:
             depth, geom = renderer.surface(q[i], cameras[i])
             link = np.where(geom >= 0, body_link[renderer.model.geom_bodyid[geom]], -1)
-            inside = (link >= 0) & (picture.coverage > 0.999)
+            inside = (link >= 0) & (picture.alpha > 0.999)
             points.append(
                 _surface_points(robot, q[i], cameras[i], depth, link, inside, picture.rgb)
             )
-    images = Images(q=q, cameras=stack_cameras(cameras), rgb=rgb, coverage=coverage)
+    images = Images(q=q, cameras=stack_cameras(cameras), rgb=rgb, alpha=alpha)
     return images, np.concatenate(points) if points else np.zeros((0, 7), np.float32)
 
 
@@ -287,7 +287,7 @@ def _write_images(file: Path, images: Images, points: np.ndarray) -> None:
             handle,
             q=images.q,
             rgb=images.rgb,
-            coverage=images.coverage,
+            coverage=images.alpha,
             points=points,
             world_to_cam=np.asarray(images.cameras.world_to_cam),
             focal=np.asarray(images.cameras.focal),
@@ -305,7 +305,7 @@ def _read_images(file: Path) -> tuple[Images, np.ndarray]:
             height=height,
             width=width,
         )
-        images = Images(q=saved["q"], cameras=cameras, rgb=saved["rgb"], coverage=saved["coverage"])
+        images = Images(q=saved["q"], cameras=cameras, rgb=saved["rgb"], alpha=saved["coverage"])
         return images, saved["points"]
 
 
@@ -322,7 +322,7 @@ def shrink(images: Images, size_px: int) -> Images:
         q=images.q,
         cameras=shrunk(images.cameras, factor),
         rgb=blocks(images.rgb),
-        coverage=blocks(images.coverage),
+        alpha=blocks(images.alpha),
     )
 
 
@@ -395,9 +395,9 @@ def _fit_level(
     optimizer = optax.adam(schedule, b1=0.9, b2=0.99)
     state = optimizer.init(change)
 
-    def loss(change, q, camera, rgb, coverage):
+    def loss(change, q, camera, rgb, alpha):
         image = render(_assemble(start, change), link_poses(robot.chain, q), camera)
-        return image_loss(*image, rgb, coverage, jnp.ones_like(coverage))
+        return image_loss(*image, rgb, alpha, jnp.ones_like(alpha))
 
     @jax.jit
     def step(change, state, *batch):
@@ -429,7 +429,7 @@ def _fit_level(
             jnp.asarray(train.q[rows], jnp.float32),
             jax.tree.map(lambda leaf: leaf[rows], train.cameras),  # noqa: B023 - used at once
             jnp.asarray(train.rgb[rows]),
-            jnp.asarray(train.coverage[rows]),
+            jnp.asarray(train.alpha[rows]),
         )
         change, state, value = step(change, state, *batch)
         if i % 50 == 49:
@@ -449,9 +449,9 @@ def validate(robot, splats: SplatModel, images: Images) -> tuple[np.ndarray, np.
     """Losses (n,) at the true poses, and covered shares (n,) of the images."""
 
     @jax.jit
-    def loss(q, camera, rgb, coverage):
+    def loss(q, camera, rgb, alpha):
         image = render(splats, link_poses(robot.chain, q), camera)
-        return image_loss(*image, rgb, coverage, jnp.ones_like(coverage))
+        return image_loss(*image, rgb, alpha, jnp.ones_like(alpha))
 
     losses = [
         float(
@@ -459,12 +459,12 @@ def validate(robot, splats: SplatModel, images: Images) -> tuple[np.ndarray, np.
                 jnp.asarray(images.q[i], jnp.float32),
                 jax.tree.map(lambda leaf: leaf[i], images.cameras),  # noqa: B023 - used at once
                 jnp.asarray(images.rgb[i], jnp.float32),
-                jnp.asarray(images.coverage[i], jnp.float32),
+                jnp.asarray(images.alpha[i], jnp.float32),
             )
         )
         for i in range(len(images.q))
     ]
-    covered = images.coverage.reshape(len(losses), -1).astype(np.float32).mean(axis=1)
+    covered = images.alpha.reshape(len(losses), -1).astype(np.float32).mean(axis=1)
     return np.array(losses), np.maximum(covered, 1e-3)
 
 

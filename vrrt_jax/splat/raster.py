@@ -30,11 +30,11 @@ from vrrt_jax.splat.types import Camera, SplatModel
 LANES = 32  # that are rendered at once
 NEAR = 0.05  # [m] splats nearer than this to the camera plane are not drawn
 PIXEL_BLUR = 0.1  # [px] a pixel's own footprint, added to every splat's; more costs up to 3 dB
-# The faintest footprint that counts in a float32 coverage, 6e-8, times exp(-66) is still a normal
+# The faintest footprint that counts in a float32 alpha, 6e-8, times exp(-66) is still a normal
 # number. So a splat keeps its color however far it is behind the nearest one.
 MIN_LOG_WEIGHT = -66.0
 MIN_WEIGHT = 1e-37
-FAINTEST = 1e-3  # what a splat may add to color or coverage outside its window
+FAINTEST = 1e-3  # what a splat may add to color or alpha outside its window
 
 
 @pytree
@@ -80,7 +80,7 @@ def render(
         windows: from :func:`choose_windows`, for the model that came with it.
 
     Returns:
-        rgb (H, W, 3), the robot over black, and coverage (H, W).
+        rgb (H, W, 3), the robot over black, and alpha (H, W).
     """
     layout = _Layout((camera.height, camera.width), model.starts, windows)
     splats, depth = _project(model, poses, camera)
@@ -90,8 +90,8 @@ def render(
         room = jnp.array([[camera.width - windows.px], [camera.height - windows.px]])
         corner = jnp.minimum(low, room)
         places = _Places(corner, jnp.all(high <= corner + windows.px, axis=0))
-    rgb, coverage = _composite(_image(splats, places, layout))
-    return jnp.moveaxis(rgb, 0, -1), coverage
+    rgb, alpha = _composite(_image(splats, places, layout))
+    return jnp.moveaxis(rgb, 0, -1), alpha
 
 
 def map_lanes(f: Callable, *args: Any) -> Any:
@@ -158,7 +158,7 @@ def _by_link(matrices: jax.Array, of_link: jax.Array, vectors: jax.Array) -> jax
 
 @jax.custom_vjp
 def _composite(total: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Color (3, H, W) and coverage (H, W) from sums (L, 5, H, W) of the layers.
+    """Color (3, H, W) and alpha (H, W) from sums (L, 5, H, W) of the layers.
 
     The channels are weighted rgb, weight and density.
     """
@@ -168,59 +168,59 @@ def _composite(total: jax.Array) -> tuple[jax.Array, jax.Array]:
 def _composite_fwd(total):
     # Weights may be so small that their square, which automatic derivatives take, underflows.
     inverse = 1.0 / (total[:, 3] + MIN_WEIGHT)
-    coverage = 1.0 - jnp.exp(-total[:, 4])
+    alpha = 1.0 - jnp.exp(-total[:, 4])
     color = total[:, :3] * inverse[:, None]
-    rgb = color * coverage[:, None]
-    over, merges = (rgb[0], coverage[0], total[0, 3]), []
+    rgb = color * alpha[:, None]
+    over, merges = (rgb[0], alpha[0], total[0, 3]), []
     for layer in range(1, len(total)):
         merges.append(over)
-        over = _merge(over, (rgb[layer], coverage[layer], total[layer, 3]))
-    return over[:2], (color, rgb, coverage, inverse, merges, total[:, 3])
+        over = _merge(over, (rgb[layer], alpha[layer], total[layer, 3]))
+    return over[:2], (color, rgb, alpha, inverse, merges, total[:, 3])
 
 
 def _merge(a, b):
     """Two layers as one: each hides the other where it is in front and as far as it covers."""
-    (rgb_a, cover_a, weight_a), (rgb_b, cover_b, weight_b) = a, b
+    (rgb_a, alpha_a, weight_a), (rgb_b, alpha_b, weight_b) = a, b
     weight = weight_a + weight_b
     b_in_front = weight_b / (weight + MIN_WEIGHT)
-    rgb = rgb_a * (1.0 - cover_b * b_in_front) + rgb_b * (1.0 - cover_a * (1.0 - b_in_front))
-    return rgb, cover_a + cover_b - cover_a * cover_b, weight
+    rgb = rgb_a * (1.0 - alpha_b * b_in_front) + rgb_b * (1.0 - alpha_a * (1.0 - b_in_front))
+    return rgb, alpha_a + alpha_b - alpha_a * alpha_b, weight
 
 
 def _merge_bar(a, b, bars):
-    (rgb_a, cover_a, weight_a), (rgb_b, cover_b, weight_b) = a, b
-    rgb_bar, cover_bar, weight_bar = bars
+    (rgb_a, alpha_a, weight_a), (rgb_b, alpha_b, weight_b) = a, b
+    rgb_bar, alpha_bar, weight_bar = bars
     inverse = 1.0 / (weight_a + weight_b + MIN_WEIGHT)
     b_in_front = weight_b * inverse
     a_in_front = 1.0 - b_in_front
     hidden_a = sum(rgb_bar[c] * rgb_a[c] for c in range(3))
     hidden_b = sum(rgb_bar[c] * rgb_b[c] for c in range(3))
-    front_bar = (cover_a * hidden_b - cover_b * hidden_a) * inverse
+    front_bar = (alpha_a * hidden_b - alpha_b * hidden_a) * inverse
     a_bar = (
-        rgb_bar * (1.0 - cover_b * b_in_front),
-        cover_bar * (1.0 - cover_b) - a_in_front * hidden_b,
+        rgb_bar * (1.0 - alpha_b * b_in_front),
+        alpha_bar * (1.0 - alpha_b) - a_in_front * hidden_b,
         weight_bar - front_bar * b_in_front,
     )
     b_bar = (
-        rgb_bar * (1.0 - cover_a * a_in_front),
-        cover_bar * (1.0 - cover_a) - b_in_front * hidden_a,
+        rgb_bar * (1.0 - alpha_a * a_in_front),
+        alpha_bar * (1.0 - alpha_a) - b_in_front * hidden_a,
         weight_bar + front_bar * a_in_front,
     )
     return lax.optimization_barrier((a_bar, b_bar))
 
 
 def _composite_bwd(residuals, bars):
-    color, rgb, coverage, inverse, merges, weight = residuals
+    color, rgb, alpha, inverse, merges, weight = residuals
     bars, layer_bars = (*bars, jnp.zeros_like(bars[1])), []
     for layer in range(len(merges), 0, -1):
-        own = (rgb[layer], coverage[layer], weight[layer])
+        own = (rgb[layer], alpha[layer], weight[layer])
         bars, own_bars = _merge_bar(merges[layer - 1], own, bars)
         layer_bars.insert(0, own_bars)
     total_bars = []
-    for layer, (rgb_bar, cover_bar, weight_bar) in enumerate([bars, *layer_bars]):
+    for layer, (rgb_bar, alpha_bar, weight_bar) in enumerate([bars, *layer_bars]):
         along = sum(rgb_bar[c] * color[layer, c] for c in range(3))
-        scale = coverage[layer] * inverse[layer]
-        density_bar = (cover_bar + along) * (1.0 - coverage[layer])
+        scale = alpha[layer] * inverse[layer]
+        density_bar = (alpha_bar + along) * (1.0 - alpha[layer])
         total_bars += [rgb_bar * scale, (weight_bar - along * scale)[None], density_bar[None]]
     total_bars = lax.optimization_barrier(total_bars)
     return (jnp.concatenate(total_bars).reshape(len(weight), 5, *weight.shape[1:]),)

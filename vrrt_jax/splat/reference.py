@@ -43,7 +43,7 @@ def composite(
         size: (H, W), static.
 
     Returns:
-        rgb (H, W, 3) over black, and coverage (H, W).
+        rgb (H, W, 3) over black, and alpha (H, W).
     """
     order = jnp.argsort(depth)
     y, x = (jnp.arange(n, dtype=pixel.dtype) + 0.5 for n in size)
@@ -69,7 +69,7 @@ def render_gaussians(gaussians: Gaussians, camera: Camera) -> tuple[jax.Array, j
         camera: the view; its size is the image's.
 
     Returns:
-        rgb (H, W, 3) over black, and coverage (H, W).
+        rgb (H, W, 3) over black, and alpha (H, W).
     """
     pixel, depth = project(camera, gaussians.mean)
     visible = depth > NEAR
@@ -119,7 +119,7 @@ def render_reference(
         camera: the view; its size is the image's.
 
     Returns:
-        rgb (H, W, 3), the robot over black, and coverage (H, W).
+        rgb (H, W, 3), the robot over black, and alpha (H, W).
     """
     rotation, translation = poses[model.link, :3, :3], poses[model.link, :3, 3]
     mean = jnp.einsum("gij,gj->gi", rotation, model.mean) + translation

@@ -56,21 +56,21 @@ class Sight:
             ValueError: the masks leave nothing of the robot.
         """
         goal, cameras = prepare_goal(self.images, self.cameras, image_px, self.masks)
-        if not jnp.any(goal.valid * goal.coverage > 0):
+        if not jnp.any(goal.valid * goal.alpha > 0):
             raise ValueError(
-                f"the masks leave nothing of the robot on images of {goal.coverage.shape[1]} px; "
+                f"the masks leave nothing of the robot on images of {goal.alpha.shape[1]} px; "
                 "a larger image_px, probe_px and polish_px keep more where many pixels are hidden"
             )
-        level = self.self_model.level_for(goal.coverage.shape[1])
+        level = self.self_model.level_for(goal.alpha.shape[1])
         splats, windows = _windowed(self.robot, level.splats, cameras)
-        covered = float(jnp.sum(goal.valid * goal.coverage) / jnp.sum(goal.valid))
+        covered = float(jnp.sum(goal.valid * goal.alpha) / jnp.sum(goal.valid))
         fields = {"splats": splats, "windows": windows, "cameras": cameras, "goal": goal}
         return fields, match_scale * level.match_threshold * covered
 
     def close_up(self, policy: VisualPolicy, image_px: int, match_scale: float) -> CloseUp | None:
         """How to look at a part of images of a height; not at all, where they are much smaller."""
         goal, cameras = prepare_goal(self.images, self.cameras, image_px, self.masks)
-        if goal.coverage.shape[1] < LEAST_HEIGHT * image_px:
+        if goal.alpha.shape[1] < LEAST_HEIGHT * image_px:
             return None
         level = self.self_model.close_up
         seen = {"splats": level.splats, "windows": None, "cameras": cameras, "goal": goal}

@@ -202,7 +202,7 @@ def _at_hand(world: World, fine: Closer, close_up: CloseUp, q: np.ndarray) -> tu
     goal, cameras = cut_goal(whole.goal, whole.cameras, middle, close_up.px)
     # The fewer of its pixels are known, the less it says.
     known = max(float(np.mean(goal.valid)), 1e-6)
-    covered = float(np.mean(goal.valid * goal.coverage)) / known
+    covered = float(np.mean(goal.valid * goal.alpha)) / known
     policy = dataclasses.replace(whole, goal=goal, cameras=cameras)
     closer = dataclasses.replace(fine, policy=policy, prior=jnp.float32(0))
     return closer, close_up.match_threshold * max(covered, LEAST_COVERED) / known

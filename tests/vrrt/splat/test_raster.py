@@ -106,8 +106,8 @@ def test_gradients_are_those_of_finite_differences(panda, rng, size):
         @jax.jit
         def loss(x):
             changed = dataclasses.replace(model, **{name: x[name] for name in names})
-            rgb, coverage = render(changed, link_poses(chain, x["q"]), camera)
-            return jnp.sum(weight * jnp.concatenate([rgb, coverage[..., None]], axis=-1) ** 2)
+            rgb, alpha = render(changed, link_poses(chain, x["q"]), camera)
+            return jnp.sum(weight * jnp.concatenate([rgb, alpha[..., None]], axis=-1) ** 2)
 
         x = {name: getattr(model, name) for name in names}
         x["q"] = jnp.asarray(rng.uniform(panda.lower, panda.upper))
@@ -153,7 +153,7 @@ def test_a_splat_behind_the_camera_changes_nothing():
 
 
 @pytest.mark.parametrize("windows", [None, Windows(cluster=1, px=24)])
-def test_far_splats_keep_their_colour(windows):
+def test_far_splats_keep_their_color(windows):
     """Four meters behind the nearest, at the smallest tau: exp(-133) is zero in float32."""
     model = splats(
         [[1.0, 0.25, 0.0], [5.0, -1.25, 0.0]], [[1, 0, 0], [0, 1, 0]], radius=(0.03, 0.15)
@@ -166,10 +166,10 @@ def test_far_splats_keep_their_colour(windows):
         return squares(render(model, poses, ahead(), windows))
 
     poses = jnp.eye(4)[None]
-    rgb, coverage = jax.jit(lambda p: render(model, p, ahead(), windows))(poses)
-    row, column = np.unravel_index(np.argmax(rgb[..., 1]), coverage.shape)
-    assert coverage[row, column] > 0.5
-    np.testing.assert_allclose(rgb[row, column, 1], coverage[row, column], rtol=1e-3)
+    rgb, alpha = jax.jit(lambda p: render(model, p, ahead(), windows))(poses)
+    row, column = np.unravel_index(np.argmax(rgb[..., 1]), alpha.shape)
+    assert alpha[row, column] > 0.5
+    np.testing.assert_allclose(rgb[row, column, 1], alpha[row, column], rtol=1e-3)
     assert np.all(np.isfinite(gradient(poses))) and np.any(gradient(poses) != 0)
 
 
@@ -209,8 +209,8 @@ def test_clusters_that_fit_and_others_mix(rng):
     weight = jnp.asarray(rng.normal(size=(48, 40, 4)), jnp.float32)
 
     def loss(mean, *windows):
-        rgb, coverage = render(splats(mean), jnp.eye(4)[None], ahead(), *windows)
-        return jnp.sum(weight * jnp.concatenate([rgb, coverage[..., None]], axis=-1))
+        rgb, alpha = render(splats(mean), jnp.eye(4)[None], ahead(), *windows)
+        return jnp.sum(weight * jnp.concatenate([rgb, alpha[..., None]], axis=-1))
 
     value, gradient = jax.jit(jax.value_and_grad(loss))(mean)
     cut = jax.jit(jax.value_and_grad(lambda mean: loss(mean, Windows(cluster=16, px=12))))
@@ -241,19 +241,19 @@ def test_a_layer_hides_another_only_as_far_as_it_covers():
     )
 
     def image(model):
-        rgb, coverage = jax.jit(lambda p: render(model, p, ahead()))(jnp.eye(4)[None])
-        return np.asarray(rgb), np.asarray(coverage)
+        rgb, alpha = jax.jit(lambda p: render(model, p, ahead()))(jnp.eye(4)[None])
+        return np.asarray(rgb), np.asarray(alpha)
 
-    one, coverage = image(model)
+    one, alpha = image(model)
     two, covered_by_both = image(dataclasses.replace(model, starts=(0, 1)))
     far = dataclasses.replace(model, density=jnp.array([0.0, 3.0]))
     near = dataclasses.replace(model, density=jnp.array([9.0, 0.0]))
-    near_coverage, far_coverage = image(near)[1], image(far)[1]
-    np.testing.assert_allclose(covered_by_both, coverage, atol=FLOAT32_TOLERANCE)
-    np.testing.assert_allclose(two[..., 0], near_coverage, atol=0.01)
-    np.testing.assert_allclose(two[..., 1], (1 - near_coverage) * far_coverage, atol=0.01)
-    edge = (near_coverage > 0.001) & (near_coverage < 0.05)
-    assert np.all(one[edge, 0] > 0.9 * coverage[edge])  # a single layer paints it all over
+    near_alpha, far_alpha = image(near)[1], image(far)[1]
+    np.testing.assert_allclose(covered_by_both, alpha, atol=FLOAT32_TOLERANCE)
+    np.testing.assert_allclose(two[..., 0], near_alpha, atol=0.01)
+    np.testing.assert_allclose(two[..., 1], (1 - near_alpha) * far_alpha, atol=0.01)
+    edge = (near_alpha > 0.001) & (near_alpha < 0.05)
+    assert np.all(one[edge, 0] > 0.9 * alpha[edge])  # a single layer paints it all over
 
 
 def test_the_order_of_layers_does_not_matter():
@@ -292,14 +292,14 @@ def test_any_nesting_of_maps_gives_the_same(panda, panda_splats, panda_camera, p
     poses = jax.vmap(lambda q: link_poses(panda.chain, q))(panda_q)
     model, windows = choose_windows(panda_splats, poses, panda_camera)
 
-    def coverage(poses, camera):
+    def alpha(poses, camera):
         return render(model, poses, camera, windows)[1]
 
-    one = jax.jit(coverage)
+    one = jax.jit(alpha)
     expected = np.stack([[one(p, c) for c in (panda_camera, other)] for p in poses])
-    over_views = jax.vmap(coverage, (None, 0))
+    over_views = jax.vmap(alpha, (None, 0))
     by_lane = jax.jit(jax.vmap(over_views, (0, None)))(poses, cameras)
-    by_view = jax.jit(jax.vmap(jax.vmap(coverage, (0, None)), (None, 0), 1))(poses, cameras)
+    by_view = jax.jit(jax.vmap(jax.vmap(alpha, (0, None)), (None, 0), 1))(poses, cameras)
     by_map = jax.jit(lambda p: map_lanes(lambda p: over_views(p, cameras), p))(poses)
     for actual in (by_lane, by_view, by_map):
         np.testing.assert_allclose(actual, expected, atol=FLOAT32_TOLERANCE)

@@ -14,7 +14,7 @@ from vrrt_jax.splat.raster import PIXEL_BLUR, render
 from vrrt_jax.splat.reference import Gaussians, composite, render_gaussians, render_reference
 from vrrt_jax.splat.types import SplatModel
 
-COVERAGE_TOLERANCE = 1e-5  # worst seen 3e-6
+ALPHA_TOLERANCE = 1e-5  # worst seen 3e-6
 DIFFERENCE_TOLERANCE = 1e-6  # relative, of float64 gradients; worst seen 1e-8
 
 
@@ -36,7 +36,7 @@ def gaussians(rng, num=6):
 
 def painted(pixel, covariance, depth, density, rgb, size):
     """Front to back, pixel by pixel."""
-    image, coverage = np.zeros((*size, 3)), np.zeros(size)
+    image, alpha = np.zeros((*size, 3)), np.zeros(size)
     for row, column in np.ndindex(size):
         light = 1.0
         for g in np.argsort(depth):
@@ -45,8 +45,8 @@ def painted(pixel, covariance, depth, density, rgb, size):
             alpha = 1.0 - np.exp(-density[g] * footprint)
             image[row, column] += light * alpha * rgb[g]
             light *= 1.0 - alpha
-        coverage[row, column] = 1.0 - light
-    return image, coverage
+        alpha[row, column] = 1.0 - light
+    return image, alpha
 
 
 def test_composite_is_the_painters_loop(rng):
@@ -79,8 +79,8 @@ def test_a_long_gaussian_has_the_moments_of_its_projection():
             density=jnp.array([1e-3]),
             rgb=jnp.ones((1, 3)),
         )
-        coverage = np.asarray(jax.jit(render_gaussians)(one, camera)[1], np.float64)
-        share = coverage / coverage.sum()
+        alpha = np.asarray(jax.jit(render_gaussians)(one, camera)[1], np.float64)
+        share = alpha / alpha.sum()
         focal = float(camera.focal)
         for offset, scale in ((x, along_x), (y, along_y)):
             expected = (focal * scale / 2.0) ** 2 + PIXEL_BLUR**2
@@ -120,8 +120,8 @@ def test_gradients_are_those_of_finite_differences(rng, size):
 
         @jax.jit
         def loss(x):
-            rgb, coverage = render_gaussians(x, ahead(*size))
-            return jnp.sum(weight * jnp.concatenate([rgb, coverage[..., None]], axis=-1))
+            rgb, alpha = render_gaussians(x, ahead(*size))
+            return jnp.sum(weight * jnp.concatenate([rgb, alpha[..., None]], axis=-1))
 
         x = gaussians(rng)
         gradient = jax.jit(jax.grad(loss))(x)
@@ -146,8 +146,8 @@ def test_a_gaussian_out_of_view_leaves_a_black_image_and_no_gradient(rng, mean):
     @jax.jit
     @jax.value_and_grad
     def loss(x):
-        rgb, coverage = render_gaussians(x, ahead())
-        return jnp.sum(rgb) + jnp.sum(coverage)
+        rgb, alpha = render_gaussians(x, ahead())
+        return jnp.sum(rgb) + jnp.sum(alpha)
 
     value, gradient = loss(one)
     assert value == 0.0
@@ -155,17 +155,17 @@ def test_a_gaussian_out_of_view_leaves_a_black_image_and_no_gradient(rng, mean):
         np.testing.assert_array_equal(leaf, 0.0)
 
 
-def test_the_fast_rasterizer_has_the_same_coverage(panda, rng):
+def test_the_fast_rasterizer_has_the_same_alpha(panda, rng):
     """1 - prod(1 - alpha) = 1 - exp(-sum), also where splats overlap."""
     model = random_splats(panda, 200, rng)
     camera = look_at((1.5, 1.2, 0.9), (0, 0, 0.4), height=40, width=48)
     poses = link_poses(panda.chain, jnp.asarray(rng.uniform(panda.lower, panda.upper), jnp.float32))
     fast, exact = (jax.jit(f)(model, poses, camera)[1] for f in (render, render_reference))
     assert exact.max() > 0.9
-    np.testing.assert_allclose(fast, exact, atol=COVERAGE_TOLERANCE)
+    np.testing.assert_allclose(fast, exact, atol=ALPHA_TOLERANCE)
 
 
-def test_the_fast_rasterizer_has_the_same_colours_where_splats_do_not_overlap():
+def test_the_fast_rasterizer_has_the_same_colors_where_splats_do_not_overlap():
     """Shaded splats on two turned links, each in its own corner."""
     quarter = jnp.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     poses = jnp.stack([jnp.eye(4), jnp.eye(4).at[:3, :3].set(quarter)])
@@ -181,9 +181,9 @@ def test_the_fast_rasterizer_has_the_same_colours_where_splats_do_not_overlap():
         tau=jnp.float32(0.03),
     )
     fast, _ = jax.jit(render)(model, poses, ahead(60, 60))
-    exact, coverage = jax.jit(render_reference)(model, poses, ahead(60, 60))
+    exact, alpha = jax.jit(render_reference)(model, poses, ahead(60, 60))
     assert np.all(np.max(exact, axis=(0, 1)) > 0.3)
-    clear = np.asarray(coverage) > 0.05  # elsewhere, tails of different splats mix
+    clear = np.asarray(alpha) > 0.05  # elsewhere, tails of different splats mix
     np.testing.assert_allclose(fast[clear], exact[clear], atol=1e-4)
 
 
