@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 
 from vrrt_jax.robots.kinematics import Chain, link_poses
-from vrrt_jax.splat.raster import Windows, render
+from vrrt_jax.splat.raster import render
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
+from vrrt_jax.splat.windows import Windows
 
 
 def image_loss(

@@ -14,9 +14,10 @@ from vrrt_jax.core.search import Termination, make_termination
 from vrrt_jax.robots.kinematics import batch_link_poses
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.splat.images import prepare_goal
+from vrrt_jax.splat.lanes import LANES
 from vrrt_jax.splat.model import SelfModel
-from vrrt_jax.splat.raster import LANES, Windows, choose_windows
 from vrrt_jax.splat.types import Camera, SplatModel
+from vrrt_jax.splat.windows import Windows, choose_windows
 from vrrt_jax.visual.policy import Probing, VisualPolicy
 from vrrt_jax.visual.polish import Closer, CloseUp, Polishing
 

@@ -19,9 +19,10 @@ from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.rewire import rewire
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
 from vrrt_jax.scene.world import World, is_free
+from vrrt_jax.splat.lanes import map_lanes
 from vrrt_jax.splat.loss import goal_loss
-from vrrt_jax.splat.raster import Windows, map_lanes
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
+from vrrt_jax.splat.windows import Windows
 
 CHILDREN = 16  # of a probe, in a generation
 SPREAD_FIRST, SPREAD_LAST = 0.8, 0.2  # [rad] standard deviations of their joints

@@ -24,8 +24,8 @@ from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.scene.world import World, is_free
 from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.images import cut_goal
+from vrrt_jax.splat.lanes import map_lanes
 from vrrt_jax.splat.loss import weighted_goal, weighted_image
-from vrrt_jax.splat.raster import map_lanes
 from vrrt_jax.splat.types import Camera, SplatModel
 from vrrt_jax.visual.policy import VisualPolicy
 
