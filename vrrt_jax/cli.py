@@ -234,9 +234,9 @@ def _render(arguments: argparse.Namespace) -> int:
     camera = problems.camera_from_dict(problems.read_json(arguments.camera), (height, width))
     q = checks.check_limits(robot, np.array(arguments.q), "configuration")
     picture = MeshRenderer(_meshes(robot)).picture(q, camera)
-    if not picture.coverage.any():
+    if not picture.alpha.any():
         raise ValueError("the camera does not see the robot at this configuration; nothing written")
-    write_image(arguments.out, picture.rgb, picture.coverage)
+    write_image(arguments.out, picture.rgb, picture.alpha)
     print(f"wrote {arguments.out}")
     return EXIT_SOLVED
 
@@ -308,11 +308,11 @@ def _speed(arguments: argparse.Namespace) -> int:
 
 
 def _twins(arguments: argparse.Namespace) -> int:
-    from vrrt_jax.bench import twins
+    from vrrt_jax.bench import pose_ambiguity
 
     if arguments.figure:
-        twins.draw(arguments.figure)
-    return _figures(twins.run(arguments.tasks_per_level), arguments)
+        pose_ambiguity.draw(arguments.figure)
+    return _figures(pose_ambiguity.run(arguments.tasks_per_level), arguments)
 
 
 def _figures(figures: dict[str, Any], arguments: argparse.Namespace) -> int:

@@ -75,7 +75,7 @@ def iteration_split(problem: Problem, repeats: int = 15) -> dict:
     return {
         "lanes": policy.lanes,
         "num_splats": goal.splats.num_splats,
-        "image_px": list(goal.image.coverage.shape[1:]),
+        "image_px": list(goal.image.alpha.shape[1:]),
         "capacity": config.tree.capacity,
         "tree_nodes": int(tree.size),
         **{f"{name}_ms": round(value, 2) for name, value in times.items()},

@@ -15,8 +15,8 @@ from vrrt_jax.robots.robot import Robot
 from vrrt_jax.splat.images import prepare_goal
 from vrrt_jax.splat.loss import goal_loss, weighted_goal, weighted_image
 from vrrt_jax.splat.model import SelfModel
-from vrrt_jax.splat.raster import Windows, choose_windows
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
+from vrrt_jax.splat.windows import Windows, choose_windows
 
 LEAST_HEIGHT = 0.75  # of an image for a close-up, in units of the height that it is meant for
 
@@ -95,15 +95,15 @@ class ImageGoal:
         """
         cameras, images, masks = self.views
         image, shrunk_cameras = prepare_goal(images, cameras, image_px, masks)
-        if not jnp.any(image.valid * image.coverage > 0):
+        if not jnp.any(image.valid * image.alpha > 0):
             raise ValueError(
-                f"the masks leave nothing of the robot on images of {image.coverage.shape[1]} px; "
+                f"the masks leave nothing of the robot on images of {image.alpha.shape[1]} px; "
                 "larger tree.image_px, seeds.px and polish.px keep more where many are hidden"
             )
-        level = self.self_model.level_for(image.coverage.shape[1])
+        level = self.self_model.level_for(image.alpha.shape[1])
         splats, windows = _windowed(robot, level.splats, shrunk_cameras)
         # The calibrated threshold is in units of the share of the image that the robot covers.
-        covered = float(jnp.sum(image.valid * image.coverage) / jnp.sum(image.valid))
+        covered = float(jnp.sum(image.valid * image.alpha) / jnp.sum(image.valid))
         return self.objective(
             splats=splats,
             windows=windows,
@@ -121,7 +121,7 @@ class ImageGoal:
         """
         cameras, images, masks = self.views
         image, shrunk_cameras = prepare_goal(images, cameras, image_px, masks)
-        if image.coverage.shape[1] < LEAST_HEIGHT * image_px:
+        if image.alpha.shape[1] < LEAST_HEIGHT * image_px:
             return None
         level = self.self_model.close_up
         objective = self.objective(

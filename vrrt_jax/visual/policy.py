@@ -20,7 +20,7 @@ from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.rewire import rewire
 from vrrt_jax.core.types import Expansion, Goal, Proposals, Tree, pytree, static
 from vrrt_jax.scene.world import World
-from vrrt_jax.splat.raster import map_lanes
+from vrrt_jax.splat.lanes import map_lanes
 
 MAX_RANK = 1024  # best nodes that the frontier's law ranks; its weight there is below 1e-40
 

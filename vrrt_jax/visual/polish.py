@@ -25,7 +25,7 @@ from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.scene.world import World
 from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.images import cut_goal
-from vrrt_jax.splat.raster import map_lanes
+from vrrt_jax.splat.lanes import map_lanes
 from vrrt_jax.splat.types import Camera, SplatModel
 from vrrt_jax.visual.distinct import distinct, steps_between
 from vrrt_jax.visual.goal import CloseUp
@@ -199,7 +199,7 @@ def _hand_goal(
     image, cameras = cut_goal(whole.image, whole.cameras, middle, close_up.px)
     # The fewer of its pixels are known, the less it says.
     known = max(float(np.mean(image.valid)), 1e-6)
-    covered = float(np.mean(image.valid * image.coverage)) / known
+    covered = float(np.mean(image.valid * image.alpha)) / known
     objective = dataclasses.replace(whole, image=image, cameras=cameras)
     goal = dataclasses.replace(fine, goal=objective, prior=jnp.float32(0))
     return goal, close_up.threshold * max(covered, LEAST_COVERED) / known

@@ -15,7 +15,7 @@ from vrrt_jax.core.edges import enforce_bounds
 from vrrt_jax.core.parallel import map_on_threads
 from vrrt_jax.core.types import Goal, pytree, static
 from vrrt_jax.scene.world import World
-from vrrt_jax.splat.raster import LANES, map_lanes
+from vrrt_jax.splat.lanes import LANES, map_lanes
 from vrrt_jax.visual.descent import adam_descent
 
 CHILDREN = 16  # of a seed, in a generation

@@ -47,9 +47,9 @@ def camera():
 def picture(panda, self_model, camera, q, level=1):
     splats = self_model.levels[level].splats
     poses = vrrt_jax.link_poses(panda.chain, jnp.asarray(q))
-    rgb, coverage = jax.jit(vrrt_jax.render)(splats, poses, camera)
-    straight = rgb / jnp.maximum(coverage, 1e-3)[..., None]
-    return np.clip(np.concatenate([straight, coverage[..., None]], axis=-1), 0, 1)
+    rgb, alpha = jax.jit(vrrt_jax.render)(splats, poses, camera)
+    straight = rgb / jnp.maximum(alpha, 1e-3)[..., None]
+    return np.clip(np.concatenate([straight, alpha[..., None]], axis=-1), 0, 1)
 
 
 @pytest.fixture(scope="module")
