@@ -8,8 +8,15 @@ import mujoco
 import numpy as np
 
 from vrrt_jax.core.types import pytree, static
-from vrrt_jax.robots.kinematics import Chain, Spheres, chain_from_model, link_poses
+from vrrt_jax.robots.kinematics import (
+    Chain,
+    Spheres,
+    chain_from_model,
+    link_poses,
+    spheres_on_links,
+)
 from vrrt_jax.robots.packaged import scenes_dir
+from vrrt_jax.robots.sphere_cover import cover_primitives
 
 FOOTPRINT = "footprint"  # geom of a round base that never tilts: a cylinder, not spheres
 _NAMES = ("snake", "fetch")  # files in scenes/mobile_robots
@@ -106,14 +113,10 @@ def load_robot(name: str) -> MobileRobot:
     base_dim = 2 if planar else 3
     is_footprint = np.array([model.geom(g).name == FOOTPRINT for g in range(model.ngeom)])
     is_base = body_link[model.geom_bodyid] <= base_dim
-    cover, owner = _cover(
-        model,
-        np.flatnonzero(~is_footprint),
-        body_link,
-        body_in_link,
-        planar=planar,
-        grain=np.where(is_base, *_GRAIN[name]),
-    )
+    # Spheres stand for all but the footprint, which is checked as the cylinder that it is.
+    covered = np.flatnonzero(~is_footprint)
+    grain = np.where(is_base, *_GRAIN[name])[covered]
+    spheres, owner = cover_primitives(model, covered, grain, planar=planar)
     limited = model.jnt_limited.astype(bool)
     angular = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
     lower = np.where(limited, model.jnt_range[:, 0], -np.pi)[base_dim:]
@@ -125,7 +128,7 @@ def load_robot(name: str) -> MobileRobot:
         lower=jnp.asarray(lower, jnp.float32),
         upper=jnp.asarray(upper, jnp.float32),
         is_continuous=jnp.asarray(~limited & angular),
-        collision_spheres=cover,
+        collision_spheres=spheres_on_links(spheres, body_link, body_in_link),
         self_collision_pairs=jnp.asarray(
             _checked_pairs(model, owner[: 0 if planar else None]), jnp.int32
         ),
@@ -161,72 +164,6 @@ def _plates(model: mujoco.MjModel, body_link: np.ndarray, body_in_link: np.ndarr
         link=tuple(body_link[body].tolist()),
         pairs=tuple(map(tuple, _checked_pairs(model, geoms).tolist())),
     )
-
-
-def _cover(
-    model: mujoco.MjModel,
-    geoms: np.ndarray,
-    body_link: np.ndarray,
-    body_in_link: np.ndarray,
-    *,
-    planar: bool,
-    grain: np.ndarray,
-) -> tuple[Spheres, np.ndarray]:
-    """Spheres that cover some geoms, in the links' frames, and the geom of each."""
-    link, center, radius, owner = [], [], [], []
-    for geom in geoms:
-        centers, radii = cover_geom(
-            mujoco.mjtGeom(model.geom_type[geom]),
-            model.geom_size[geom] * ([1, 1, 0] if planar else [1, 1, 1]),
-            float(grain[geom]),
-        )
-        body = model.geom_bodyid[geom]
-        rotation = np.zeros(9)
-        mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-        in_body = centers @ rotation.reshape(3, 3).T + model.geom_pos[geom]
-        pose = body_in_link[body]
-        center.append(in_body @ pose[:3, :3].T + pose[:3, 3])
-        radius.append(radii)
-        link += [body_link[body]] * len(centers)
-        owner += [geom] * len(centers)
-    spheres = Spheres(
-        link=jnp.asarray(np.array(link), jnp.int32),
-        center=jnp.asarray(np.concatenate(center), jnp.float32),
-        radius=jnp.asarray(np.concatenate(radius), jnp.float32),
-    )
-    return spheres, np.array(owner)
-
-
-def cover_geom(
-    kind: mujoco.mjtGeom, size: np.ndarray, grain: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Spheres that cover a geom: a box brick by brick, a capsule along its axis.
-
-    Args:
-        kind: sphere, capsule or box.
-        size: (3,) as MuJoCo's [m].
-        grain: half the longest side of a brick, half the longest way between two spheres [m].
-
-    Returns:
-        Centers (n, 3) in the geom's frame and radii (n,).
-
-    Raises:
-        ValueError: another kind.
-    """
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        return np.zeros((1, 3)), size[:1]
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        radius, half = size[:2]
-        count = int(np.ceil(half / grain - 1e-6))
-        centers = np.zeros((count + 1, 3))
-        centers[:, 2] = np.linspace(-half, half, count + 1)
-        return centers, np.full(count + 1, np.hypot(radius, half / count))
-    if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        counts = np.maximum(np.ceil(size / grain - 1e-6), 1).astype(int)
-        ticks = [h * (2 * np.arange(n) + 1 - n) / n for h, n in zip(size, counts, strict=True)]
-        centers = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-        return centers, np.full(len(centers), np.linalg.norm(size / counts))
-    raise ValueError(f"geom of kind {kind.name}: expected spheres, capsules and boxes")
 
 
 def _checked_pairs(model: mujoco.MjModel, owner: np.ndarray) -> np.ndarray:

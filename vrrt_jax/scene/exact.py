@@ -139,7 +139,7 @@ def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> Exac
     is_obstacle = model.geom_bodyid >= num_bodies
     sees_obstacles = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     if not has_meshes:
-        sees_obstacles = model.geom_group == int(mjcf_writer.COVER["group"])
+        sees_obstacles = model.geom_group == int(mjcf_writer.COLLISION_GEOM["group"])
     is_moving = model.body_weldid[model.geom_bodyid] != 0
     return ExactScene(
         model=model,

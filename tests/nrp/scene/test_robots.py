@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import nrp_jax
-from nrp_jax.scene.robots import cover_geom
 from vrrt_jax.robots.kinematics import batch_link_poses, link_poses
+from vrrt_jax.robots.sphere_cover import cover_geom
 
 
 @pytest.fixture(params=["snake", "fetch"])

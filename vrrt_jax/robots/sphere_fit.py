@@ -1,4 +1,7 @@
-"""Cover a body with few spheres that stick out little where obstacles could be.
+"""Fit few spheres to a body, which stick out little where obstacles could be; takes minutes.
+
+The command ``vrrt spheres`` fits with it. Robots are loaded with the quick covers of
+:mod:`vrrt_jax.robots.sphere_cover`.
 
 The spheres of a body minimize the volume of false alarms: places for the center of a ball-shaped
 obstacle that touches a sphere but not the robot. They are found by gradient descent from several
