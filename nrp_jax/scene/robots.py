@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from nrp_jax.scene.mobile_mjcf import mobile_mjcf
 from vrrt_jax.core.types import pytree, static
 from vrrt_jax.robots.kinematics import (
     Chain,
@@ -15,7 +16,6 @@ from vrrt_jax.robots.kinematics import (
     link_poses,
     spheres_on_links,
 )
-from vrrt_jax.robots.packaged import scenes_dir
 from vrrt_jax.robots.sphere_cover import cover_primitives
 
 FOOTPRINT = "footprint"  # geom of a round base that never tilts: a cylinder, not spheres
@@ -106,7 +106,7 @@ def load_robot(name: str) -> MobileRobot:
     """
     if name not in _NAMES:
         raise ValueError(f"unknown robot '{name}'; have: {', '.join(_NAMES)}")
-    xml = (scenes_dir() / "mobile_robots" / f"{name}.xml").read_text()
+    xml = mobile_mjcf(name)
     model = mujoco.MjModel.from_xml_string(xml)
     chain, body_link, body_in_link = chain_from_model(model)
     planar = name == "snake"
