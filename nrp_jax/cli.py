@@ -103,7 +103,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         except ModuleNotFoundError:
             print("no figure: matplotlib is missing; pip install 'vrrt-jax[plot]'", file=sys.stderr)
     if not result.ok:
-        problem = result.verification.problem if result.verification else None
+        problem = result.verification.contact if result.verification else None
         print(f"{result.status.value}{f' ({problem})' if problem else ''}", file=sys.stderr)
     return EXIT_SOLVED if result.ok else EXIT_UNSOLVED
 

@@ -141,7 +141,7 @@ def run(robot: MobileRobot, grid: Grid, num: int = 10_000, timed: int = 500) -> 
     batched = np.concatenate([np.asarray(batch_is_free(world, b)) for b in _batches(q)])
     loop, scene = SphereLoop(robot, grid), ExactScene(robot, grid)
     by_loop = np.array([loop.is_free(row) for row in q])
-    by_mujoco = np.array([scene.touching(row) is None for row in q])
+    by_mujoco = np.array([not scene.touching(row) for row in q])
     batch, rows = q[:BATCH], q[:timed]
     rates = {
         "batched": _rate(len(batch), lambda: batch_is_free(world, batch), 20),
