@@ -10,15 +10,9 @@ import numpy as np
 from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 from vrrt_jax.robots.robot import Robot
+from vrrt_jax.scene.obstacle_kinds import KINDS
 from vrrt_jax.scene.obstacles import Obstacle
 
-_KINDS = {
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "plane": mujoco.mjtGeom.mjGEOM_PLANE,
-}
 _GEOMETRIES = ("auto", "meshes", "spheres")
 _ALL_BITS = 0x7FFFFFFF
 _SAME_ROBOT = 1e-3  # [m] between the body frames of meshes and of spheres at home
@@ -194,15 +188,14 @@ def _exclude(spec: mujoco.MjSpec, allowed: Sequence[tuple[str, str]]) -> None:
 
 def _add_obstacle(spec: mujoco.MjSpec, obstacle: Obstacle, bits: int) -> None:
     """Add an obstacle as a body of its own, so that contacts can name it."""
-    if obstacle.kind not in _KINDS:
+    if obstacle.kind not in KINDS:
         raise ValueError(
             f"obstacle '{obstacle.name}' is a '{obstacle.kind}'; expected one of: "
-            f"{', '.join(_KINDS)}"
+            f"{', '.join(KINDS)}"
         )
-    size = np.array(obstacle.size)
-    if obstacle.kind == "plane":
-        size[2] = 1.0  # the spacing of the grid that is drawn; zero does not compile
+    kind = KINDS[obstacle.kind]
     body = spec.worldbody.add_body(
         name=f"obstacle: {obstacle.name}", pos=obstacle.position, quat=obstacle.quaternion
     )
-    body.add_geom(type=_KINDS[obstacle.kind], size=size, contype=bits, conaffinity=bits)
+    size = kind.geom_size(obstacle.size)
+    body.add_geom(type=kind.geom, size=size, contype=bits, conaffinity=bits)
