@@ -12,7 +12,7 @@ from nrp_jax.scene import reeds_shepp
 from nrp_jax.scene.field import DistanceField, clearance_bound, make_field
 from nrp_jax.scene.robots import MobileRobot, PlanarBoxes
 from vrrt_jax.core.edges import StraightLineEdges, joint_steps
-from vrrt_jax.core.types import pytree, static
+from vrrt_jax.core.types import PytreeSubclasses, pytree, static
 from vrrt_jax.robots.kinematics import Chain, Spheres, link_poses, place, placement
 
 ARM_WEIGHT = {"snake": 0.167, "fetch": 0.125}  # of the paper's metrics
@@ -32,32 +32,51 @@ class RoundBase:
 
 
 @pytree
-class GridWorld(StraightLineEdges):
+class GridWorld(PytreeSubclasses, StraightLineEdges):
     """What planners ask about a robot on a sliding base in a home; edges are straight.
 
-    An edge's length is that of the base's way plus ``arm_weight`` times that of the arm's; its
-    sub-steps move no joint by more than ``resolution``.
+    An edge's length is the base's length plus ``arm_weight`` times the arm's length. Its sub-steps
+    move no joint by more than ``resolution``.
+
+    Subclass it to add a constraint of your own: planners ask :meth:`is_free` only. Subclasses are
+    pytree dataclasses by themselves, so that new fields may be arrays.
+
+    Letters: ``D`` joints with the base's, ``n`` collision spheres, ``L`` links.
     """
 
     chain: Chain
-    collision_spheres: jax.Array  # (L * 12, 3 n) placement of the covering spheres
+    collision_spheres: jax.Array  # (L * 12, 3 n) their placement, see ``kinematics.placement``
     collision_radius: jax.Array  # (n,) [m]
     floor: jax.Array  # (n,) lowest height of their centers, -inf if they may touch the floor [m]
-    plates: PlanarBoxes | None  # checked against each other instead
-    contact_distance: (
-        jax.Array
-    )  # (m, n) at which the last m touch others, 0 for pairs not checked [m]
+    plates: PlanarBoxes | None  # flat links checked against each other, instead of spheres
+    # (m, n) distances at which the last m spheres touch the others, 0 for pairs not checked [m]
+    contact_distance: jax.Array
     base: RoundBase | None
     field: DistanceField
-    lower: jax.Array  # (D,)
-    upper: jax.Array  # (D,)
-    is_continuous: jax.Array  # (D,) bool
-    arm_weight: jax.Array  # () meters a radian of the arm counts for
+    lower: jax.Array  # (D,) [rad] or [m]
+    upper: jax.Array  # (D,) [rad] or [m]
+    is_continuous: jax.Array  # (D,) bool, joints that turn for ever
+    arm_weight: jax.Array  # () meters that a radian of the arm counts for
     resolution: jax.Array  # () longest sub-step of any joint [m] or [rad]
 
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`is_free`."""
-        return is_free(self, q)
+        poses = link_poses(self.chain, q)
+        # The barrier keeps XLA's CPU fusions from placing the spheres once for every use.
+        centers = jax.lax.optimization_barrier(place(self.collision_spheres, poses))
+        # Self-collision: only the last m of n spheres have partners, see ``contact_distance``.
+        first = self.contact_distance.shape[1] - self.contact_distance.shape[0]
+        apart = sum((axis[first:, None] - axis) ** 2 for axis in centers)
+        free = jnp.all(apart >= self.contact_distance**2)
+        # The home and its floor.
+        free &= jnp.all(clearance_bound(self.field, centers) > self.collision_radius)
+        free &= jnp.all(centers[2] > self.floor)
+        # Parts of the robot that are not spheres.
+        if self.plates is not None:
+            free &= _plates_apart(self.plates, poses)
+        if self.base is not None:
+            free &= _base_is_free(self.base, poses, centers, self.collision_radius, self.floor)
+        return free
 
     def interpolate(self, q_a: jax.Array, q_b: jax.Array, fraction: jax.Array) -> jax.Array:
         """Configurations (..., D) at a fraction (...) of the edges between others (..., D)."""
@@ -179,23 +198,12 @@ class CarWorld(GridWorld):
 
 
 def is_free(world: GridWorld, q: jax.Array) -> jax.Array:
-    """Whether ``q`` (D,) touches no solid cell, not the floor, nor itself, () bool.
+    """Whether ``q`` (D,) touches no solid cell, not the floor, nor the robot itself, () bool.
 
-    Joint limits are not looked at; beside the map all is solid. Pure and vmappable.
+    Joint limits are not checked; beside the map all is solid. Pure and vmappable. This is
+    ``world.is_free``, so that a subclass that overrides it is obeyed.
     """
-    poses = link_poses(world.chain, q)
-    # The barrier keeps XLA's CPU fusions from placing the spheres once for every use.
-    centers = jax.lax.optimization_barrier(place(world.collision_spheres, poses))
-    first = world.contact_distance.shape[1] - world.contact_distance.shape[0]
-    apart = sum((axis[first:, None] - axis) ** 2 for axis in centers)
-    free = jnp.all(apart >= world.contact_distance**2)
-    free &= jnp.all(clearance_bound(world.field, centers) > world.collision_radius)
-    free &= jnp.all(centers[2] > world.floor)
-    if world.plates is not None:
-        free &= _plates_apart(world.plates, poses)
-    if world.base is not None:
-        free &= _base_is_free(world.base, poses, centers, world.collision_radius, world.floor)
-    return free
+    return world.is_free(q)
 
 
 batch_is_free = jax.jit(jax.vmap(is_free, (None, 0)))  # of q (n, D), for the host
@@ -277,7 +285,7 @@ def build_world(
         "collision_radius": robot.collision_spheres.radius,
         "floor": jnp.asarray(floor, jnp.float32),
         "plates": robot.plates,
-        "contact_distance": jnp.asarray(_reach(robot)),
+        "contact_distance": jnp.asarray(_contact_distance(robot)),
         "base": _round_base(robot, grid),
         "field": make_field(grid),
         "lower": _float(np.concatenate([corner, np.negative(turn), robot.lower])),
@@ -332,17 +340,16 @@ def _fitting(planar: bool, grid: Grid) -> Grid:
     return grid
 
 
-def _reach(robot: MobileRobot) -> np.ndarray:
-    """Sums of the radii (m, n) of pairs of the last m of n spheres with any; 0 if not checked."""
-    radius, (first, second) = (
-        np.asarray(robot.collision_spheres.radius),
-        np.asarray(robot.self_collision_pairs).T,
-    )
+def _contact_distance(robot: MobileRobot) -> np.ndarray:
+    """Sums of the radii (m, n) of checked pairs, of the last m spheres with any; else 0 [m]."""
+    radius = np.asarray(robot.collision_spheres.radius)
+    first, second = np.asarray(robot.self_collision_pairs).T
     if not len(first):
         return np.zeros((0, len(radius)), np.float32)
-    reach = np.zeros((len(radius),) * 2, np.float32)
-    reach[second, first] = radius[first] + radius[second]
-    return reach[second.min() :]
+    # The second sphere of a pair is the later one: rows before the first of these are all zero.
+    distance = np.zeros((len(radius),) * 2, np.float32)
+    distance[second, first] = radius[first] + radius[second]
+    return distance[second.min() :]
 
 
 def _round_base(robot: MobileRobot, grid: Grid) -> RoundBase | None:
