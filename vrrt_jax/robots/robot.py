@@ -173,7 +173,7 @@ def _robot(*, model: mujoco.MjModel, **fields) -> Robot:
     """Assemble a robot from its compiled collision model."""
     chain, body_link, body_in_link = chain_from_model(model)
     lower, upper = mjcf.joint_ranges(model)
-    spheres = {}
+    geoms_of_kind, spheres = {}, {}
     for label, kind in (
         ("collision_sphere", mjcf_writer.COLLISION_GEOM),
         ("self_collision_sphere", mjcf_writer.SELF_COLLISION_GEOM),
@@ -185,6 +185,7 @@ def _robot(*, model: mujoco.MjModel, **fields) -> Robot:
             radius=model.geom_size[geoms, 0],
         )
         spheres[f"{label}s"] = spheres_on_links(of_kind, body_link, body_in_link)
+        geoms_of_kind[label] = geoms
         spheres[f"{label}_bodies"] = tuple(model.body(body).name for body in of_kind.body)
     # The first body of the base gives link 0 its name.
     base = next((b for b in range(1, model.nbody) if body_link[b] == 0), 0)
@@ -197,7 +198,9 @@ def _robot(*, model: mujoco.MjModel, **fields) -> Robot:
         upper=upper,
         is_continuous=model.jnt_limited == 0,
         home=model.key_qpos[0].copy(),
-        self_collision_pairs=self_collision.checked_pairs(model),
+        self_collision_pairs=self_collision.checked_pairs(
+            model, geoms_of_kind["self_collision_sphere"]
+        ),
         **spheres,
         **fields,
     )

@@ -6,32 +6,35 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.mjcf import joint_ranges
 
 _NUM_DRAFT = 500  # configurations in which a draft of spheres is checked
 _ALWAYS = 0.98  # a pair of bodies that touches in a larger share of configurations is ignored
 
 
-def checked_pairs(model: mujoco.MjModel) -> np.ndarray:
-    """Pairs of self-collision spheres that C MuJoCo checks in a collision model.
+def checked_pairs(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
+    """Pairs of geoms that C MuJoCo checks for contact, by its own rules.
 
     Args:
-        model: compiled from :func:`vrrt_jax.robots.mjcf_writer.collision_mjcf`.
+        model: a compiled robot.
+        geoms: (n,) indices of geoms. A geom that several spheres stand for may come several times.
 
     Returns:
-        (P, 2) i32 indices among the self-collision spheres, in the order of the geoms.
+        (P, 2) i32 indices into ``geoms``, the smaller one first.
     """
-    geoms = np.flatnonzero(model.geom_group == int(mjcf_writer.SELF_COLLISION_GEOM["group"]))
-    body = model.geom_bodyid[geoms]
     first, second = np.triu_indices(len(geoms), 1)
+    # The contact bits of the two geoms must meet.
+    types, affinities = model.geom_contype[geoms], model.geom_conaffinity[geoms]
+    do_bits_meet = (types[first] & affinities[second]) | (types[second] & affinities[first])
+    # Bodies welded together are one. A parent and its child touch at the joint, and are left out
+    # unless the parent is the base.
+    body = model.geom_bodyid[geoms]
     weld = model.body_weldid[body]
     parent = model.body_weldid[model.body_parentid[weld]]
     a, b = weld[first], weld[second]
-    # As in MuJoCo: a parent and its child touch at the joint, unless the parent is the base.
     is_adjacent = ((a == parent[second]) | (b == parent[first])) & (a != 0) & (b != 0)
     is_excluded = np.isin(_signature(body[first], body[second]), model.exclude_signature)
-    keep = (a != b) & ~is_adjacent & ~is_excluded
+    keep = (do_bits_meet != 0) & (a != b) & ~is_adjacent & ~is_excluded
     return np.stack([first[keep], second[keep]], -1).astype(np.int32)
 
 

@@ -70,7 +70,7 @@ def _fit_to(
     """
     geoms = np.flatnonzero(draft.geom_group == int(mjcf_writer.SELF_COLLISION_GEOM["group"]))
     start = draft.geom_size[geoms, 0]
-    pairs = checked_pairs(draft)
+    pairs = checked_pairs(draft, geoms)
     is_used = np.isin(np.arange(len(geoms)), pairs)
     if not (len(pairs) and truth.any()):
         return start, is_used
