@@ -39,6 +39,7 @@ class CarWorld(GridWorld):
         The shortlist goes by a bound: no drive is shorter than the straight line, nor than its turn
         at the smallest radius. The nearest is nearly always in it.
         """
+        # Bounds for all nodes, joint by joint: a straight line, or a turn on the smallest circle.
         line, arm = jnp.zeros((2, q.shape[0], nodes.shape[0]), q.dtype)
         for joint in range(q.shape[1]):
             step = joint_steps(self, nodes, q, joint)
@@ -48,6 +49,7 @@ class CarWorld(GridWorld):
             line, arm = (line + step**2, arm) if joint < 2 else (line, arm + step**2)
         bound = jnp.maximum(jnp.sqrt(line), turn) + self.arm_weight * jnp.sqrt(arm)
         bound = jnp.where(among, bound, jnp.inf)
+        # Exact lengths for the shortlist only: a curve costs far more than a bound.
         nearest, index = _shortlist(bound)
         exact = self.distance(q[:, None], nodes[index])
         exact = jnp.where(jnp.isfinite(nearest), exact, jnp.inf)
@@ -78,7 +80,7 @@ class CarWorld(GridWorld):
         return self._drive(edge) + self.arm_weight * norm(edge.arm)
 
     def span(self, edge: CarEdge) -> jax.Array:
-        """The longest way (...) of base, with what it turns, or any joint [m] or [rad]."""
+        """The longest distance (...) that any joint moves, the base with its turns [m] or [rad]."""
         base = reeds_shepp.extent(edge.curve, self.radius)
         return jnp.maximum(base, jnp.max(jnp.abs(edge.arm), axis=-1))
 

@@ -143,6 +143,7 @@ def _solid_boxes(grid: Grid, planar: bool) -> list[tuple[np.ndarray, np.ndarray]
         (origin + low * grid.resolution - tall, origin + high * grid.resolution + tall)
         for low, high in merge_cells(grid.occupied)
     ]
+    # Four walls around the map, higher and deeper than it.
     first, last = origin.copy(), origin + grid.size
     first[2], last[2] = first[2] - _WALL, last[2] + 3 * _WALL
     for axis in (0, 1):
@@ -162,6 +163,7 @@ def merge_cells(occupied: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
 
     Runs along x, joined along y and then along z where they are alike.
     """
+    # Where a run of solid cells along x begins (1) and where it has ended (-1).
     padded = np.pad(occupied, [(1, 1), (0, 0), (0, 0)]).astype(np.int8)
     change = np.moveaxis(np.diff(padded, axis=0), 0, 2)  # (Y, Z, X + 1)
     first, last = np.argwhere(change == 1), np.argwhere(change == -1)
@@ -178,6 +180,7 @@ def _joined(boxes: np.ndarray, column: int) -> np.ndarray:
         return boxes
     others = [c for c in range(6) if c not in (column, column + 1)]
     boxes = boxes[np.lexsort([boxes[:, column], *boxes[:, others].T])]
+    # A box continues the one before if all other extents agree and it begins where that one ends.
     alike = (boxes[1:, others] == boxes[:-1, others]).all(axis=1)
     follows = alike & (boxes[1:, column] == boxes[:-1, column + 1])
     begins = np.flatnonzero(np.concatenate([[True], ~follows]))

@@ -87,7 +87,7 @@ class GridWorld(PytreeSubclasses, StraightLineEdges):
         return norm(edge[..., :2]) + self.arm_weight * norm(edge[..., 2:])
 
     def span(self, edge: jax.Array) -> jax.Array:
-        """The longest way (...) of any joint along an edge [m] or [rad]."""
+        """The longest distance (...) that any joint moves along an edge [m] or [rad]."""
         return jnp.max(jnp.abs(edge), axis=-1)
 
     def steer(self, q_from: jax.Array, target: jax.Array, num_steps: int) -> jax.Array:

@@ -71,6 +71,7 @@ def link_poses(chain: Chain, q: jax.Array) -> jax.Array:
         + jnp.sin(angle) * chain.sine
         + angle * chain.slide
     )
+    # Parents come before their children: each link's pose follows from a pose known already.
     poses = [jnp.eye(4, dtype=local.dtype)]
     for j, parent in enumerate(chain.parents):
         poses.append(local[j] if parent == 0 else _product(poses[parent], local[j]))
@@ -205,7 +206,7 @@ def _joint_terms(model: mujoco.MjModel, joint: int, offset: np.ndarray) -> np.nd
             term[:3, :3] = rotation
             term[:3, 3] = -rotation @ anchor
         constant[:3, 3] += anchor
-        # cos(q - q0) and sin(q - q0), expanded
+        # cos(q - q0) and sin(q - q0), expanded.
         c, s = np.cos(reference), np.sin(reference)
         cosine, sine = c * cosine - s * sine, s * cosine + c * sine
     else:

@@ -1,4 +1,4 @@
-"""The same question put to MJX: the oracle of :mod:`vrrt_jax.scene.world`.
+"""The same question put to MJX: the oracle of :mod:`vrrt_jax.scene.closed_form`.
 
 This is the only file that touches MJX's internals. Every jit around it needs
 ``compiler_options={"xla_cpu_use_fusion_emitters": False}`` on a CPU, or it runs thousands of times
