@@ -150,7 +150,8 @@ def cover_body(
 
     Args:
         pieces: convex pieces of the body.
-        bulge: how far a sphere may stick out of the piece that it lies in [m], give or take 2 mm.
+        bulge: how far a chosen sphere sticks out of the piece that it lies in [m]. Some spheres
+            grow beyond it at last, to close gaps between the samples of the surface.
         rng: source of randomness.
 
     Returns:
