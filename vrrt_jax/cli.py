@@ -265,7 +265,7 @@ def _fit(arguments: argparse.Namespace) -> int:
 
 def _spheres(arguments: argparse.Namespace) -> int:
     from vrrt_jax.robots import load_robot
-    from vrrt_jax.robots.fit import fit_spheres
+    from vrrt_jax.robots.robot_fit import fit_spheres
     from vrrt_jax.scene.sphere_errors import measure_spheres
 
     robot = load_robot(arguments.robot, freeze=arguments.freeze)

@@ -1,4 +1,4 @@
-"""The last word on a path: C MuJoCo, the robot's own primitives, every solid cell as a box.
+"""The independent check of a path in a home: C MuJoCo, the robot's own primitives, boxes of cells.
 
 Nothing here shares code with the distances and spheres that the planners compute, so that an error
 there cannot hide itself.
@@ -11,13 +11,18 @@ from nrp_jax.homes.grid import Grid
 from nrp_jax.scene.robots import MobileRobot
 from vrrt_jax.core.result import Verification
 
-STEP = 0.02  # [m] and [rad], how fine a trajectory must be
+STEP = 0.02  # [m] and [rad], largest distance between configurations of a trajectory, by joint
 _WALL = 1.0  # [m] thickness of what stands around the map
-_SLACK = 1e-6  # [m] deeper contacts count
+_PENETRATION_TOLERANCE = 1e-6  # [m] deeper contacts count
+_LIMIT_TOLERANCE = 1e-4  # [rad] or [m], trajectories come in float32
+_STEP_TOLERANCE = 1e-4  # [rad] or [m]
+_SLIDE_TOLERANCE = 3e-3  # [m] a base that drives like a car may slide sideways in a step
+# Contact bits: of the home's cells and of its floor; the robot's file says what sees which.
+_CELL_BIT, _FLOOR_BIT = 4, 8
 
 
 class ExactScene:
-    """A robot among boxes in C MuJoCo."""
+    """A robot and a home in C MuJoCo."""
 
     def __init__(self, robot: MobileRobot, grid: Grid):
         """Compile the scene; the snake sees the planar map."""
@@ -30,28 +35,33 @@ class ExactScene:
                 type=mujoco.mjtGeom.mjGEOM_BOX,
                 pos=(low + high) / 2,
                 size=(high - low) / 2,
-                contype=4,
+                contype=_CELL_BIT,
                 conaffinity=0,
             )
         if not robot.planar:
             spec.worldbody.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1], contype=8, conaffinity=0
+                type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1], contype=_FLOOR_BIT, conaffinity=0
             )
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
 
-    def touching(self, q: np.ndarray) -> str | None:
-        """What touches what at ``q`` (D,), if anything does."""
+    def touching(self, q: np.ndarray) -> list[tuple[int, int]]:
+        """Pairs of bodies, smaller index first, that penetrate each other at ``q`` (D,).
+
+        The home is body 0. Pairs come in the order of MuJoCo's contacts.
+        """
         self.data.qpos[:] = q
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_collision(self.model, self.data)
-        contacts = self.data.contact
-        deep = np.flatnonzero(contacts.dist < -_SLACK)
-        if not len(deep):
-            return None
-        bodies = [int(self.model.geom_bodyid[g]) for g in contacts.geom[deep[0]]]
-        names = [self.model.body(b).name if b else "the map" for b in sorted(bodies)]
-        return f"{names[1]} touches {names[0]}"
+        contact = self.data.contact
+        deep = contact.geom[contact.dist < -_PENETRATION_TOLERANCE]
+        bodies = np.sort(self.model.geom_bodyid[deep], axis=1)
+        return list(dict.fromkeys((int(first), int(second)) for first, second in bodies))
+
+    def describe(self, pair: tuple[int, int]) -> str:
+        """Words for a pair of bodies: "link3 touches the map"."""
+        first, second = (self.model.body(body).name if body else "the map" for body in pair)
+        return f"{second} touches {first}"
 
 
 def verify(
@@ -64,44 +74,48 @@ def verify(
     """Check a fine trajectory: limits, steps, how the base may roll, and contacts.
 
     Args:
-        scene: where it happens.
-        trajectory: (T, D) configurations, no farther apart than 0.02 m or rad.
-        lower: (D,) limits; those of joints that turn for ever are not looked at.
-        upper: (D,) limits.
+        scene: robot and home.
+        trajectory: (T, D) configurations, no farther apart than 0.02 m or rad in any joint.
+        lower: (D,) limits [rad] or [m]; those of joints that turn for ever are ignored.
+        upper: (D,) limits [rad] or [m].
     """
     trajectory = np.asarray(trajectory, np.float64)
-    problem = _motion_problem(scene.robot, trajectory, lower, upper)
+    if violation := _motion_violation(scene.robot, trajectory, lower, upper):
+        return Verification(ok=False, checked=min(len(trajectory), 1), contact=violation)
     for index, q in enumerate(trajectory):
-        if contact := problem or scene.touching(q):
+        if pairs := scene.touching(q):
             share = 100 * index / max(len(trajectory) - 1, 1)
-            where = "" if problem else f" at {share:.0f} % of the path"
-            return Verification(ok=False, checked=index + 1, contact=contact + where)
+            contact = f"{scene.describe(pairs[0])} at {share:.0f} % of the path"
+            return Verification(ok=False, checked=index + 1, contact=contact)
     return Verification(ok=True, checked=len(trajectory), contact=None)
 
 
-def _motion_problem(
+def _motion_violation(
     robot: MobileRobot,
     trajectory: np.ndarray,
     lower: np.ndarray,
     upper: np.ndarray,
 ) -> str | None:
-    """What is wrong with a trajectory (T, D) before anything is touched."""
+    """What is wrong with a trajectory (T, D) before contacts are asked for."""
     if not np.isfinite(trajectory).all():
         return "the path is not finite"
     is_continuous = np.asarray(robot.is_continuous)
-    outside = ((trajectory < lower - 1e-4) | (trajectory > upper + 1e-4)) & ~is_continuous
+    outside = (
+        (trajectory < lower - _LIMIT_TOLERANCE) | (trajectory > upper + _LIMIT_TOLERANCE)
+    ) & (~is_continuous)
     if outside.any():
         joint = int(np.argwhere(outside)[0, 1])
         return f"{robot.joint_names[joint]} leaves its limits"
     step = np.diff(trajectory, axis=0)
     step[:, is_continuous] = (step[:, is_continuous] + np.pi) % (2 * np.pi) - np.pi
-    if (np.abs(step) > STEP * 1.01 + 1e-4).any():
+    if (np.abs(step) > STEP * 1.01 + _STEP_TOLERANCE).any():
         return f"the path has a gap of {np.abs(step).max():.3f}"
-    if robot.base_dim == 2:  # it slides; one that turns drives like a car
+    # A base that slides goes anywhere. One that turns rolls along its heading in mid-step.
+    if robot.base_dim == 2:
         return None
     middle = trajectory[:-1, 2] + step[:, 2] / 2
     sideways = np.abs(step[:, 1] * np.cos(middle) - step[:, 0] * np.sin(middle))
-    if (sideways > 3e-3).any():
+    if (sideways > _SLIDE_TOLERANCE).any():
         return f"the base slides sideways by {sideways.max():.4f} m in a step"
     return None
 
@@ -119,6 +133,7 @@ def _solid_boxes(grid: Grid, planar: bool) -> list[tuple[np.ndarray, np.ndarray]
         (origin + low * grid.resolution - tall, origin + high * grid.resolution + tall)
         for low, high in merge_cells(grid.occupied)
     ]
+    # Four walls around the map, higher and deeper than it.
     first, last = origin.copy(), origin + grid.size
     first[2], last[2] = first[2] - _WALL, last[2] + 3 * _WALL
     for axis in (0, 1):
@@ -138,6 +153,7 @@ def merge_cells(occupied: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
 
     Runs along x, joined along y and then along z where they are alike.
     """
+    # Where a run of solid cells along x begins (1) and where it has ended (-1).
     padded = np.pad(occupied, [(1, 1), (0, 0), (0, 0)]).astype(np.int8)
     change = np.moveaxis(np.diff(padded, axis=0), 0, 2)  # (Y, Z, X + 1)
     first, last = np.argwhere(change == 1), np.argwhere(change == -1)
@@ -154,6 +170,7 @@ def _joined(boxes: np.ndarray, column: int) -> np.ndarray:
         return boxes
     others = [c for c in range(6) if c not in (column, column + 1)]
     boxes = boxes[np.lexsort([boxes[:, column], *boxes[:, others].T])]
+    # A box continues the one before if all other extents agree and it begins where that one ends.
     alike = (boxes[1:, others] == boxes[:-1, others]).all(axis=1)
     follows = alike & (boxes[1:, column] == boxes[:-1, column + 1])
     begins = np.flatnonzero(np.concatenate([[True], ~follows]))

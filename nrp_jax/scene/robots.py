@@ -7,13 +7,22 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from nrp_jax.scene.mobile_mjcf import mobile_mjcf
 from vrrt_jax.core.types import pytree, static
-from vrrt_jax.robots.kinematics import Chain, Spheres, chain_from_model, link_poses
-from vrrt_jax.robots.packaged import scenes_dir
+from vrrt_jax.robots.kinematics import (
+    Chain,
+    Spheres,
+    chain_from_model,
+    link_poses,
+    spheres_on_links,
+)
+from vrrt_jax.robots.mjcf import joint_ranges
+from vrrt_jax.robots.self_collision import checked_pairs
+from vrrt_jax.robots.sphere_cover import cover_primitives
 
 FOOTPRINT = "footprint"  # geom of a round base that never tilts: a cylinder, not spheres
 _NAMES = ("snake", "fetch")  # files in scenes/mobile_robots
-# Half the side of the bricks that a sphere covers [m], on the base and on the links.
+# Half the side of the brick that one sphere covers [m], on the base and on the links.
 _GRAIN = {"snake": (0.02, 0.0125), "fetch": (0.05, 0.05)}
 
 
@@ -23,7 +32,7 @@ class Footprint:
 
     radius: jax.Array  # () [m]
     height: jax.Array  # () of its top [m]
-    link: int = static()
+    link: int = static()  # of the base
 
 
 @pytree
@@ -32,7 +41,7 @@ class PlanarBoxes:
 
     center: jax.Array  # (M, 2) in the links' frames [m]
     half: jax.Array  # (M, 2) half sides [m]
-    link: tuple[int, ...] = static()  # (M,)
+    link: tuple[int, ...] = static()  # (M,) the link of each box
     pairs: tuple[tuple[int, int], ...] = static()  # (P, 2) which are checked against each other
 
 
@@ -48,12 +57,10 @@ class MobileRobot:
     upper: jax.Array  # (A,) [rad] or [m]
     is_continuous: jax.Array  # (D,) bool, joints that turn for ever
     collision_spheres: Spheres  # cover the robot but for its footprint: checked against obstacles
-    self_collision_pairs: (
-        jax.Array
-    )  # (P, 2) i32 indices into ``cover``: which are checked against each other
-    plates: PlanarBoxes | None  # checked against each other instead, if there are any
-    footprint: Footprint | None
-    feature_link: jax.Array  # (F,) i32
+    self_collision_pairs: jax.Array  # (P, 2) i32 indices of collision spheres to check
+    planar_boxes: PlanarBoxes | None  # checked against each other instead, if there are any
+    footprint: Footprint | None  # of a round base
+    feature_link: jax.Array  # (F,) i32, the link of each feature point
     feature_point: jax.Array  # (F, 3) in the link's frame [m]
     name: str = static()
     joint_names: tuple[str, ...] = static()  # (D,)
@@ -73,11 +80,11 @@ class MobileRobot:
 
 
 def link_features(robot: MobileRobot, q: jax.Array) -> jax.Array:
-    """Points that describe the posture: tips of the snake's links, frames of the Fetch's.
+    """Points that describe the posture: tips of the snake's links, joint frames of the Fetch.
 
     Args:
         robot: from :func:`load_robot`.
-        q: (D,) configuration.
+        q: (D,) configuration [m] and [rad].
 
     Returns:
         (F, 3) world positions [m]; z is 0 for a planar robot.
@@ -99,43 +106,39 @@ def load_robot(name: str) -> MobileRobot:
     """
     if name not in _NAMES:
         raise ValueError(f"unknown robot '{name}'; have: {', '.join(_NAMES)}")
-    xml = (scenes_dir() / "mobile_robots" / f"{name}.xml").read_text()
+    # The text is kept: exact scenes and pictures compile it with obstacles.
+    xml = mobile_mjcf(name)
     model = mujoco.MjModel.from_xml_string(xml)
     chain, body_link, body_in_link = chain_from_model(model)
     planar = name == "snake"
     base_dim = 2 if planar else 3
+    # Spheres stand for all geoms but the footprint, which is checked as the cylinder that it is.
     is_footprint = np.array([model.geom(g).name == FOOTPRINT for g in range(model.ngeom)])
     is_base = body_link[model.geom_bodyid] <= base_dim
-    cover, owner = _cover(
-        model,
-        np.flatnonzero(~is_footprint),
-        body_link,
-        body_in_link,
-        planar=planar,
-        grain=np.where(is_base, *_GRAIN[name]),
+    covered = np.flatnonzero(~is_footprint)
+    grain = np.where(is_base, *_GRAIN[name])[covered]
+    spheres, geom_of_sphere = cover_primitives(model, covered, grain, planar=planar)
+    # A planar robot is checked against itself as planar boxes, which are exact, not as spheres.
+    pairs = checked_pairs(model, geom_of_sphere[: 0 if planar else None])
+    lower, upper = joint_ranges(model)
+    is_hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+    site_link, site_point = _points_on_links(
+        model.site_bodyid, model.site_pos, body_link, body_in_link
     )
-    limited = model.jnt_limited.astype(bool)
-    angular = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
-    lower = np.where(limited, model.jnt_range[:, 0], -np.pi)[base_dim:]
-    upper = np.where(limited, model.jnt_range[:, 1], np.pi)[base_dim:]
-    site_pose = body_in_link[model.site_bodyid]
-    points = np.einsum("nij,nj->ni", site_pose[:, :3, :3], model.site_pos) + site_pose[:, :3, 3]
     return MobileRobot(
         chain=chain,
-        lower=jnp.asarray(lower, jnp.float32),
-        upper=jnp.asarray(upper, jnp.float32),
-        is_continuous=jnp.asarray(~limited & angular),
-        collision_spheres=cover,
-        self_collision_pairs=jnp.asarray(
-            _checked_pairs(model, owner[: 0 if planar else None]), jnp.int32
-        ),
-        plates=_plates(model, body_link, body_in_link) if planar else None,
+        lower=jnp.asarray(lower[base_dim:], jnp.float32),
+        upper=jnp.asarray(upper[base_dim:], jnp.float32),
+        is_continuous=jnp.asarray((model.jnt_limited == 0) & is_hinge),
+        collision_spheres=spheres_on_links(spheres, body_link, body_in_link),
+        self_collision_pairs=jnp.asarray(pairs),
+        planar_boxes=_planar_boxes(model, body_link, body_in_link) if planar else None,
         footprint=_footprint(model, body_link) if is_footprint.any() else None,
-        feature_link=jnp.asarray(body_link[model.site_bodyid], jnp.int32),
-        feature_point=jnp.asarray(points, jnp.float32),
+        feature_link=jnp.asarray(site_link, jnp.int32),
+        feature_point=jnp.asarray(site_point, jnp.float32),
         name=name,
         joint_names=tuple(model.joint(j).name for j in range(model.njnt)),
-        angular=tuple(angular.tolist()),
+        angular=tuple(is_hinge.tolist()),
         planar=planar,
         xml=xml,
     )
@@ -151,94 +154,25 @@ def _footprint(model: mujoco.MjModel, body_link: np.ndarray) -> Footprint:
     )
 
 
-def _plates(model: mujoco.MjModel, body_link: np.ndarray, body_in_link: np.ndarray) -> PlanarBoxes:
+def _planar_boxes(
+    model: mujoco.MjModel, body_link: np.ndarray, body_in_link: np.ndarray
+) -> PlanarBoxes:
+    """The boxes that are checked against each other."""
     geoms = np.flatnonzero(model.geom_contype)
-    body = model.geom_bodyid[geoms]
-    center = np.einsum("nij,nj->ni", body_in_link[body, :3, :3], model.geom_pos[geoms])
+    link, center = _points_on_links(
+        model.geom_bodyid[geoms], model.geom_pos[geoms], body_link, body_in_link
+    )
     return PlanarBoxes(
-        center=jnp.asarray((center + body_in_link[body, :3, 3])[:, :2], jnp.float32),
+        center=jnp.asarray(center[:, :2], jnp.float32),
         half=jnp.asarray(model.geom_size[geoms, :2], jnp.float32),
-        link=tuple(body_link[body].tolist()),
-        pairs=tuple(map(tuple, _checked_pairs(model, geoms).tolist())),
+        link=tuple(link.tolist()),
+        pairs=tuple(map(tuple, checked_pairs(model, geoms).tolist())),
     )
 
 
-def _cover(
-    model: mujoco.MjModel,
-    geoms: np.ndarray,
-    body_link: np.ndarray,
-    body_in_link: np.ndarray,
-    *,
-    planar: bool,
-    grain: np.ndarray,
-) -> tuple[Spheres, np.ndarray]:
-    """Spheres that cover some geoms, in the links' frames, and the geom of each."""
-    link, center, radius, owner = [], [], [], []
-    for geom in geoms:
-        centers, radii = cover_geom(
-            mujoco.mjtGeom(model.geom_type[geom]),
-            model.geom_size[geom] * ([1, 1, 0] if planar else [1, 1, 1]),
-            float(grain[geom]),
-        )
-        body = model.geom_bodyid[geom]
-        rotation = np.zeros(9)
-        mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-        in_body = centers @ rotation.reshape(3, 3).T + model.geom_pos[geom]
-        pose = body_in_link[body]
-        center.append(in_body @ pose[:3, :3].T + pose[:3, 3])
-        radius.append(radii)
-        link += [body_link[body]] * len(centers)
-        owner += [geom] * len(centers)
-    spheres = Spheres(
-        link=jnp.asarray(np.array(link), jnp.int32),
-        center=jnp.asarray(np.concatenate(center), jnp.float32),
-        radius=jnp.asarray(np.concatenate(radius), jnp.float32),
-    )
-    return spheres, np.array(owner)
-
-
-def cover_geom(
-    kind: mujoco.mjtGeom, size: np.ndarray, grain: float
+def _points_on_links(
+    body: np.ndarray, point: np.ndarray, body_link: np.ndarray, body_in_link: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Spheres that cover a geom: a box brick by brick, a capsule along its axis.
-
-    Args:
-        kind: sphere, capsule or box.
-        size: (3,) as MuJoCo's [m].
-        grain: half the longest side of a brick, half the longest way between two spheres [m].
-
-    Returns:
-        Centers (n, 3) in the geom's frame and radii (n,).
-
-    Raises:
-        ValueError: another kind.
-    """
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        return np.zeros((1, 3)), size[:1]
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        radius, half = size[:2]
-        count = int(np.ceil(half / grain - 1e-6))
-        centers = np.zeros((count + 1, 3))
-        centers[:, 2] = np.linspace(-half, half, count + 1)
-        return centers, np.full(count + 1, np.hypot(radius, half / count))
-    if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        counts = np.maximum(np.ceil(size / grain - 1e-6), 1).astype(int)
-        ticks = [h * (2 * np.arange(n) + 1 - n) / n for h, n in zip(size, counts, strict=True)]
-        centers = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-        return centers, np.full(len(centers), np.linalg.norm(size / counts))
-    raise ValueError(f"geom of kind {kind.name}: expected spheres, capsules and boxes")
-
-
-def _checked_pairs(model: mujoco.MjModel, owner: np.ndarray) -> np.ndarray:
-    """Pairs (P, 2) of spheres whose geoms may collide by MuJoCo's own rules."""
-    first, second = np.triu_indices(len(owner), 1)
-    a, b = owner[first], owner[second]
-    wanted = (model.geom_contype[a] & model.geom_conaffinity[b]) | (
-        model.geom_contype[b] & model.geom_conaffinity[a]
-    )
-    body_a, body_b = model.geom_bodyid[a], model.geom_bodyid[b]
-    parent = model.body_parentid
-    related = (body_a == body_b) | (parent[body_a] == body_b) | (parent[body_b] == body_a)
-    signature = (np.minimum(body_a, body_b) << 16) + np.maximum(body_a, body_b)
-    keep = (wanted > 0) & ~related & ~np.isin(signature, model.exclude_signature)
-    return np.stack([first[keep], second[keep]], axis=1)
+    """Links (n,) and points (n, 3) in their frames, of points (n, 3) in frames of bodies (n,)."""
+    pose = body_in_link[body]
+    return body_link[body], np.einsum("nij,nj->ni", pose[:, :3, :3], point) + pose[:, :3, 3]

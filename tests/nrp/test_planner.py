@@ -179,13 +179,13 @@ def test_verification_sees_what_is_wrong(snake, home, scene, solve):
     world = nrp_jax.build_world(snake, home)
     limits = {"lower": np.asarray(world.lower), "upper": np.asarray(world.upper)}
     through = trajectory_of(world, np.stack([START, GOAL]))
-    assert "touches the map" in verify(scene, through, **limits).problem
+    assert "touches the map" in verify(scene, through, **limits).contact
     gap = np.stack([START, START + 0.05])
-    assert "gap" in verify(scene, gap, **limits).problem
+    assert "gap" in verify(scene, gap, **limits).contact
     outside = np.array(START)[None] - [6, 0, 0, 0, 0, 0, 0, 0]
-    assert "x leaves its limits" in verify(scene, outside, **limits).problem
+    assert "x leaves its limits" in verify(scene, outside, **limits).contact
     curled = np.array([1.0, 1.0, 0, 2.6, 2.6, 2.6, 2.6, 2.6])[None]
-    assert "touches link" in verify(scene, curled, **limits).problem
+    assert "touches link" in verify(scene, curled, **limits).contact
 
 
 def test_sideways_is_seen():
@@ -196,7 +196,7 @@ def test_sideways_is_seen():
     slide[:, 1] += 0.02 * np.arange(5)
     lower, upper = np.full(11, -9.0), np.full(11, 9.0)
     found = verify(ExactScene(fetch, grid), slide, lower=lower, upper=upper)
-    assert "sideways" in found.problem
+    assert "sideways" in found.contact
 
 
 @pytest.mark.parametrize(
@@ -251,7 +251,7 @@ def test_a_refused_path_is_told(solve, monkeypatch):
 
     def refuse(scene, trajectory, **limits):
         seen.append(trajectory)
-        return Verification(ok=len(seen) == accepted, checked=1, problem="touches")
+        return Verification(ok=len(seen) == accepted, checked=1, contact="touches")
 
     monkeypatch.setattr(planner, "verify", refuse)
     accepted = 2

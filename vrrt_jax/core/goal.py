@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from vrrt_jax.core.edges import difference
-from vrrt_jax.core.types import pytree
+from vrrt_jax.core.types import PytreeSubclasses, pytree
 
 REACHED = 1e-4  # [rad] a path that ends this near to a joint goal ends there
 
@@ -27,12 +27,11 @@ class ConfigurationGoal:
         return difference(world, self.q, q)
 
 
-class LeastSquaresGoal:
+class LeastSquaresGoal(PytreeSubclasses):
     """Base of goals whose loss is a sum of squares: ``loss = sum(residual ** 2)``.
 
     A subclass overrides ``loss`` or ``residual`` and gets the other. Gradients descend on the
-    loss, Levenberg-Marquardt on the residual, so that both see what was overridden. A subclass is
-    a pytree as well: decorate it with :func:`~vrrt_jax.core.types.pytree`.
+    loss, Levenberg-Marquardt on the residual, so that both see what was overridden.
 
     A residual that is a prediction less a target may override these two instead: differences of
     predictions keep the low bits that a subtraction of the target would cost.

@@ -11,16 +11,34 @@ import jax
 import numpy as np
 
 Payload = TypeVar("Payload")
+_MARK = "_is_pytree"  # attribute of the classes that :func:`pytree` has made
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
 def pytree(cls):
     """Make a frozen, keyword-only dataclass whose fields JAX can trace.
 
-    Fields declared with :func:`static` are compile-time constants instead.
+    Fields declared with :func:`static` are compile-time constants instead. A class that is one
+    already, as a subclass of :class:`PytreeSubclasses`, stays as it is.
     """
+    if _MARK in vars(cls):
+        return cls
     cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+    setattr(cls, _MARK, True)
     return jax.tree_util.register_dataclass(cls)
+
+
+class PytreeSubclasses:
+    """A base whose subclasses are pytree dataclasses, with or without the decorator.
+
+    Without it, a user's subclass of a world that forgets :func:`pytree` would fail far away, in
+    the first compiled function that it is handed to.
+    """
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Make the subclass a pytree."""
+        super().__init_subclass__(**kwargs)
+        pytree(cls)
 
 
 def static(**kwargs: Any) -> Any:

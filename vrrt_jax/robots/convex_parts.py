@@ -7,9 +7,9 @@ import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 STEP = 1e-4  # [m] centers and radii of fitted spheres are multiples of this
-_MANY_FACES = 400  # hulls with more are simplified, outwards
+_MAX_FACES = 400  # hulls with more are simplified, outwards
 _BLOCK = 10_000_000  # numbers in memory at once
-_ROUND = 20  # sides of the prism around a cylinder, 1.2 % wider; 2.5 % for other round shapes
+_ROUND_SIDES = 20  # sides of the prism around a cylinder, 1.2 % wider; 2.5 % for other round shapes
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,8 @@ class Piece:
 def piece_of(points: np.ndarray) -> Piece:
     """The convex hull of points (n, 3) [m], or, of fine ones, a polytope just around it."""
     hull = ConvexHull(points)
-    if len(hull.simplices) > _MANY_FACES:
+    if len(hull.simplices) > _MAX_FACES:
+        # The half-spaces that touch the hull in fixed directions make up a simpler polytope.
         vertices = points[hull.vertices]
         reach = np.max(vertices @ _DIRECTIONS.T, axis=0)
         planes = np.column_stack([_DIRECTIONS, -reach])
@@ -111,16 +112,16 @@ def _corners() -> np.ndarray:
 
 
 def _circle(radius: float, z: float) -> np.ndarray:
-    angle = np.arange(_ROUND) * (2 * np.pi / _ROUND)
-    radius = radius / np.cos(np.pi / _ROUND)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(_ROUND, z)], -1)
+    angle = np.arange(_ROUND_SIDES) * (2 * np.pi / _ROUND_SIDES)
+    radius = radius / np.cos(np.pi / _ROUND_SIDES)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(_ROUND_SIDES, z)], -1)
 
 
 def _ball() -> np.ndarray:
     """Vertices (n, 3) of a polytope around the unit sphere."""
-    rings = np.linspace(-np.pi / 2, np.pi / 2, _ROUND // 2 + 1)
+    rings = np.linspace(-np.pi / 2, np.pi / 2, _ROUND_SIDES // 2 + 1)
     points = np.vstack([_circle(np.cos(a), np.sin(a)) for a in rings])
-    return points / np.cos(np.pi / _ROUND)
+    return points / np.cos(np.pi / _ROUND_SIDES)
 
 
 def surface_samples(pieces: list[Piece], spacing: float, rng: np.random.Generator) -> np.ndarray:
@@ -136,15 +137,18 @@ def surface_samples(pieces: list[Piece], spacing: float, rng: np.random.Generato
     """
     found = []
     for index, piece in enumerate(pieces):
+        # Triangles are drawn by their area, so that the points are spread evenly.
         corners = piece.vertices[piece.triangles]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         area = np.linalg.norm(cross, axis=1) / 2
         count = int(np.ceil(area.sum() / spacing**2)) + 50
         face = rng.choice(len(area), count, p=area / area.sum())
+        # Uniform in a triangle, by barycentric weights.
         u, v = np.sqrt(rng.random(count)), rng.random(count)
         weight = np.stack([1 - u, u * (1 - v), u * v], -1)
         points = np.einsum("nk,nkd->nd", weight, corners[face])
         points = np.vstack([points, piece.vertices[np.unique(piece.triangles)]])
+        # What lies inside another piece is not surface of the union.
         others = [other for k, other in enumerate(pieces) if k != index]
         found.append(points[union_depth(others, points) < 1e-6] if others else points)
     return np.vstack(found)
@@ -178,15 +182,19 @@ def contain_surface(
         triangles = piece.vertices[piece.triangles]
         others = [other for other in pieces if other is not piece]
         while len(triangles):
+            # A triangle is bare if no sphere holds all of its corners.
             corner_distance = np.linalg.norm(triangles[:, :, None] - centers, axis=-1)
-            if not others:  # all corners are surface: gaps close here, before they are split
+            # Without other pieces all corners are surface: close gaps before triangles are split.
+            if not others:
                 radii = grow(corner_distance.reshape(-1, len(radii)), radii)
             distance = corner_distance.max(1)
             is_bare = (distance > radii).all(1)
-            for other in others:  # what lies inside another piece is not surface
+            # What lies inside another piece is not surface, and may stay bare.
+            for other in others:
                 corners = triangles[is_bare].reshape(-1, 3)
                 is_bare[is_bare] = other.depth(corners).reshape(-1, 3).min(1) < 0
             triangles, distance = triangles[is_bare], distance[is_bare]
+            # Leaves are taken in by growing spheres; larger triangles are split in four.
             edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=-1)
             is_leaf = edges.max(1, initial=0) < leaf
             radii = grow(distance[is_leaf], radii)
@@ -206,6 +214,7 @@ def grow(distance: np.ndarray, radii: np.ndarray) -> np.ndarray:
     """
     radii = radii.copy()
     while len(distance):
+        # The farthest point outside is taken in by the sphere that it is nearest to.
         gap = distance - radii
         nearest = gap.min(1)
         worst = nearest.argmax()

@@ -6,6 +6,8 @@ backend may recompute the chain once for every output element, as it does with `
 XLA has no fast path for batches of 4x4 matrices (13 times slower for 1,024 configurations).
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -43,6 +45,15 @@ class Spheres:
     radius: jax.Array  # (n,) [m]
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BodySpheres:
+    """Spheres bound to bodies of a MuJoCo model, on the host."""
+
+    body: np.ndarray  # (n,) int
+    center: np.ndarray  # (n, 3) in the frame of the body [m]
+    radius: np.ndarray  # (n,) [m]
+
+
 def link_poses(chain: Chain, q: jax.Array) -> jax.Array:
     """World poses of all links.
 
@@ -60,6 +71,7 @@ def link_poses(chain: Chain, q: jax.Array) -> jax.Array:
         + jnp.sin(angle) * chain.sine
         + angle * chain.slide
     )
+    # Parents come before their children: each link's pose follows from a pose known already.
     poses = [jnp.eye(4, dtype=local.dtype)]
     for j, parent in enumerate(chain.parents):
         poses.append(local[j] if parent == 0 else _product(poses[parent], local[j]))
@@ -151,6 +163,25 @@ def chain_from_model(model: mujoco.MjModel) -> tuple[Chain, np.ndarray, np.ndarr
     return chain, body_link, body_in_link
 
 
+def spheres_on_links(
+    spheres: BodySpheres, body_link: np.ndarray, body_in_link: np.ndarray
+) -> Spheres:
+    """Bind spheres to links instead of bodies.
+
+    Args:
+        spheres: n spheres of a model's bodies.
+        body_link: (nbody,) from :func:`chain_from_model`.
+        body_in_link: (nbody, 4, 4) from :func:`chain_from_model`.
+    """
+    pose = body_in_link[spheres.body]
+    center = np.einsum("nij,nj->ni", pose[:, :3, :3], spheres.center) + pose[:, :3, 3]
+    return Spheres(
+        link=jnp.asarray(body_link[spheres.body], jnp.int32),
+        center=jnp.asarray(center, jnp.float32),
+        radius=jnp.asarray(spheres.radius, jnp.float32),
+    )
+
+
 def _pose(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
     pose = np.eye(4)
     rotation = np.zeros(9)
@@ -175,7 +206,7 @@ def _joint_terms(model: mujoco.MjModel, joint: int, offset: np.ndarray) -> np.nd
             term[:3, :3] = rotation
             term[:3, 3] = -rotation @ anchor
         constant[:3, 3] += anchor
-        # cos(q - q0) and sin(q - q0), expanded
+        # cos(q - q0) and sin(q - q0), expanded.
         c, s = np.cos(reference), np.sin(reference)
         cosine, sine = c * cosine - s * sine, s * cosine + c * sine
     else:

@@ -1,37 +1,31 @@
 """Write the collision model of a robot as MJCF: bodies, joints and spheres, no mesh."""
 
-import dataclasses
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
 
+from vrrt_jax.robots.kinematics import BodySpheres
+
 # Robot spheres of two kinds and obstacles (contype=1 conaffinity=0) share a model. MuJoCo checks
-# a pair where one's contype meets the other's conaffinity: cover against obstacle, thin against
-# thin, and nothing else.
-COVER = {"group": "3", "contype": "0", "conaffinity": "1"}
-THIN = {"group": "4", "contype": "2", "conaffinity": "2"}
+# a pair where one's contype meets the other's conaffinity: collision spheres against obstacles,
+# self-collision spheres against each other, and nothing else.
+COLLISION_GEOM = {"group": "3", "contype": "0", "conaffinity": "1"}
+SELF_COLLISION_GEOM = {"group": "4", "contype": "2", "conaffinity": "2"}
+# The names of both kinds in the text: packaged files carry them.
+_CLASSES = (("cover", COLLISION_GEOM), ("thin", SELF_COLLISION_GEOM))
 _SOURCE = "mesh_source"
 _FROZEN = "frozen: "
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class BodySpheres:
-    """Spheres bound to bodies of a model."""
-
-    body: np.ndarray  # (n,) int
-    center: np.ndarray  # (n, 3) in the frame of the body [m]
-    radius: np.ndarray  # (n,) [m]
 
 
 def collision_mjcf(
     model: mujoco.MjModel,
     *,
     name: str,
-    cover: BodySpheres,
-    thin: BodySpheres,
-    allowed: list[tuple[str, str]],
+    collision: BodySpheres,
+    self_collision: BodySpheres,
+    ignored_pairs: Sequence[tuple[str, str]],
     home: np.ndarray,
     mesh_source: str | None,
     frozen: Mapping[str, float],
@@ -42,9 +36,9 @@ def collision_mjcf(
     Args:
         model: bodies and joints to write; its geoms are left out.
         name: of the robot.
-        cover: spheres checked against obstacles.
-        thin: spheres checked against each other.
-        allowed: pairs of bodies that are not checked against each other.
+        collision: spheres checked against obstacles.
+        self_collision: spheres checked against each other.
+        ignored_pairs: pairs of bodies that are not checked against each other.
         home: (D,) joint positions of the keyframe [rad] or [m].
         mesh_source: where the true geometry is found, kept for :func:`source_of`.
         frozen: joints of the true geometry that are fixed [rad] or [m], kept likewise.
@@ -53,29 +47,31 @@ def collision_mjcf(
     root = ET.Element("mujoco", model=name)
     if comment:
         root.append(ET.Comment(comment))
-    # masses are of no interest, but bodies without spheres must compile too
+    # Masses are of no interest, but bodies without spheres must compile too.
     ET.SubElement(
         root, "compiler", angle="radian", autolimits="true", boundmass="1", boundinertia="0.01"
     )
     default = ET.SubElement(root, "default")
-    for label, bits in (("cover", COVER), ("thin", THIN)):
+    for label, bits in _CLASSES:
         ET.SubElement(ET.SubElement(default, "default", {"class": label}), "geom", bits)
+    # Bodies come parents first, so that the parent's element always stands already.
     elements = {0: ET.SubElement(root, "worldbody")}
     for body in range(model.nbody):
         if body:
             parent = elements[int(model.body_parentid[body])]
             elements[body] = _add_body(parent, model, body)
-        for label, spheres in (("cover", cover), ("thin", thin)):
+        for (label, _), spheres in zip(_CLASSES, (collision, self_collision), strict=True):
             for k in np.flatnonzero(spheres.body == body):
                 where = {"pos": _numbers(spheres.center[k]), "size": _numbers(spheres.radius[k])}
                 ET.SubElement(elements[body], "geom", {"class": label} | where)
+    # What MJCF has no element for is kept as custom text and numbers.
     custom = ET.SubElement(root, "custom")
     if mesh_source is not None:
         ET.SubElement(custom, "text", name=_SOURCE, data=mesh_source)
     for joint, position in frozen.items():
         ET.SubElement(custom, "numeric", name=_FROZEN + joint, data=_numbers(position))
     contact = ET.SubElement(root, "contact")
-    for first, second in allowed:
+    for first, second in ignored_pairs:
         ET.SubElement(contact, "exclude", body1=first, body2=second)
     ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="home", qpos=_numbers(home))
     ET.indent(root)

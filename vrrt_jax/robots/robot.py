@@ -3,16 +3,25 @@
 import dataclasses
 import functools
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from vrrt_jax.robots import mjcf, mjcf_writer, pairs, spheres, thin
-from vrrt_jax.robots.kinematics import Chain, Spheres, batch_link_poses, chain_from_model
+from vrrt_jax.robots import mjcf, mjcf_writer, self_collision
+from vrrt_jax.robots.kinematics import (
+    BodySpheres,
+    Chain,
+    Spheres,
+    batch_link_poses,
+    chain_from_model,
+    spheres_on_links,
+)
 from vrrt_jax.robots.packaged import robot_names, robot_path
+from vrrt_jax.robots.robot_spheres import RobotSpheres, spheres_of
+from vrrt_jax.robots.self_collision_radii import fit_radii
 
 _NUM_SAMPLES = 20_000  # configurations, to see which bodies never touch
 
@@ -33,23 +42,17 @@ class Robot:
     upper: np.ndarray  # (D,) [rad] or [m]; pi for an unlimited hinge
     is_continuous: np.ndarray  # (D,) bool, an unlimited hinge: q and q + 2 pi are the same
     home: np.ndarray  # (D,) a free configuration [rad] or [m]
-    collision_spheres: Spheres  # cover the moving links: checked against obstacles
-    collision_sphere_bodies: tuple[
-        str, ...
-    ]  # body of each sphere of ``collision_spheres``, for messages
-    self_collision_spheres: (
-        Spheres  # follow the surface of all links, the base too: checked against each other
-    )
-    self_collision_sphere_bodies: tuple[
-        str, ...
-    ]  # body of each sphere of ``self_collision_spheres``, for messages
-    self_collision_pairs: (
-        np.ndarray
-    )  # (P, 2) i32 indices into ``self_collision_spheres``: which are checked against each other
+    # These cover the moving links, and are checked against obstacles.
+    collision_spheres: Spheres
+    collision_sphere_bodies: tuple[str, ...]  # body of each collision sphere, for messages
+    # These follow the surface of all links, the base too, and are checked against each other.
+    self_collision_spheres: Spheres
+    self_collision_sphere_bodies: tuple[str, ...]  # body of each of them, for messages
+    self_collision_pairs: np.ndarray  # (P, 2) i32 indices of self-collision spheres to check
     ignored_pairs: tuple[tuple[str, str], ...]  # pairs of bodies that are never checked
     frozen: Mapping[str, float]  # joints of the true geometry that are fixed [rad] or [m]
     xml: str  # the collision model as MJCF; compiles by itself, without any mesh
-    mesh_source: str | None  # name or file of the true geometry, see ``sources.mesh_spec``
+    mesh_source: str | None  # name or file of the true geometry, see ``mesh_sources.mesh_spec``
 
     @property
     def num_joints(self) -> int:
@@ -75,41 +78,66 @@ def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None =
     path = robot_path(name_or_path)
     spec = mjcf.read_spec(path)
     model, home, frozen = _reduce(spec, path, freeze)
-    found = spheres.spheres_of(model)
-    allowed = pairs.excluded(model)
+    spheres = spheres_of(model)
     mesh_source = str(path.resolve())
     name = str(name_or_path) if str(name_or_path) in robot_names() else path.stem
-    if found.origin == "written":  # they stand for the robot of another file, which this one names
-        mesh_source, fixed_before = mjcf_writer.source_of(spec)
-        name, frozen = spec.modelname, fixed_before | frozen
+    if spheres.origin == "written":
+        # The spheres stand for the robot of another file, which this file names.
+        mesh_source, frozen_before = mjcf_writer.source_of(spec)
+        name, frozen = spec.modelname, frozen_before | frozen
     fields = {
         "name": name,
         "mesh_source": mesh_source,
         "frozen": frozen,
     }
     write = functools.partial(
-        mjcf_writer.collision_mjcf, model, cover=found.cover, home=home, **fields
+        mjcf_writer.collision_mjcf, model, collision=spheres.collision, home=home, **fields
     )
-    thin_spheres = found.thin
-    if found.origin != "written":
-        sample = pairs.sample_self_collisions(model, _NUM_SAMPLES, np.random.default_rng(0))
-        allowed = sorted({*allowed, *pairs.allowed_pairs(model, sample)})
-        if found.origin == "fitted":
-            thin_spheres = thin.refine(model, thin_spheres, sample, allowed, write)
-        draft = mujoco.MjModel.from_xml_string(write(thin=thin_spheres, allowed=allowed))
-        always = pairs.always_touching(draft)
-        if always:
-            warnings.warn(
-                f"the spheres of {'; '.join(' and '.join(pair) for pair in always)} touch at home, "
-                "so that these bodies are never checked against each other; fit finer ones with: "
-                "vrrt spheres",
-                stacklevel=2,
-            )
-        allowed += always
-    xml = write(thin=thin_spheres, allowed=allowed)
+    self_collision_spheres, ignored_pairs = spheres.self_collision, self_collision.excluded(model)
+    if spheres.origin != "written":
+        self_collision_spheres, ignored_pairs = _prepare_self_collision(
+            model, spheres, ignored_pairs, write
+        )
+    xml = write(self_collision=self_collision_spheres, ignored_pairs=ignored_pairs)
     return _robot(
-        model=mujoco.MjModel.from_xml_string(xml), ignored_pairs=tuple(allowed), xml=xml, **fields
+        model=mujoco.MjModel.from_xml_string(xml),
+        ignored_pairs=tuple(ignored_pairs),
+        xml=xml,
+        **fields,
     )
+
+
+def _prepare_self_collision(
+    model: mujoco.MjModel,
+    spheres: RobotSpheres,
+    ignored_pairs: list[tuple[str, str]],
+    write: Callable[..., str],
+) -> tuple[BodySpheres, list[tuple[str, str]]]:
+    """Self-collision spheres, and pairs of bodies to ignore, of a file that does not say.
+
+    Args:
+        model: the robot with its true geometry.
+        spheres: of the robot.
+        ignored_pairs: what the file excludes from contact.
+        write: :func:`vrrt_jax.robots.mjcf_writer.collision_mjcf` but for the two results.
+    """
+    # Bodies that never touch in random configurations, or nearly always, need no check.
+    sample = self_collision.sample_self_collisions(model, _NUM_SAMPLES, np.random.default_rng(0))
+    ignored = sorted({*ignored_pairs, *self_collision.find_ignored_pairs(model, sample)})
+    fitted = spheres.self_collision
+    if spheres.origin == "fitted":
+        fitted = fit_radii(model, fitted, sample, ignored, write)
+    # Coarse spheres may touch where the true bodies do not: then no configuration would be free.
+    draft = mujoco.MjModel.from_xml_string(write(self_collision=fitted, ignored_pairs=ignored))
+    always = self_collision.always_touching(draft)
+    if always:
+        warnings.warn(
+            f"the spheres of {'; '.join(' and '.join(pair) for pair in always)} touch at home, "
+            "so that these bodies are never checked against each other; fit finer ones with: "
+            "vrrt spheres",
+            stacklevel=3,
+        )
+    return fitted, ignored + always
 
 
 def workspace(robot: Robot) -> tuple[np.ndarray, float]:
@@ -145,20 +173,21 @@ def _robot(*, model: mujoco.MjModel, **fields) -> Robot:
     """Assemble a robot from its compiled collision model."""
     chain, body_link, body_in_link = chain_from_model(model)
     lower, upper = mjcf.joint_ranges(model)
-    labels = {}
-    for label, group in (
-        ("collision_sphere", mjcf_writer.COVER),
-        ("self_collision_sphere", mjcf_writer.THIN),
+    geoms_of_kind, spheres = {}, {}
+    for label, kind in (
+        ("collision_sphere", mjcf_writer.COLLISION_GEOM),
+        ("self_collision_sphere", mjcf_writer.SELF_COLLISION_GEOM),
     ):
-        geoms = np.flatnonzero(model.geom_group == int(group["group"]))
-        bodies = model.geom_bodyid[geoms]
-        center = np.einsum("nij,nj->ni", body_in_link[bodies, :3, :3], model.geom_pos[geoms])
-        labels[f"{label}s"] = Spheres(
-            link=jnp.asarray(body_link[bodies], jnp.int32),
-            center=jnp.asarray(center + body_in_link[bodies, :3, 3], jnp.float32),
-            radius=jnp.asarray(model.geom_size[geoms, 0], jnp.float32),
+        geoms = np.flatnonzero(model.geom_group == int(kind["group"]))
+        of_kind = BodySpheres(
+            body=model.geom_bodyid[geoms],
+            center=model.geom_pos[geoms],
+            radius=model.geom_size[geoms, 0],
         )
-        labels[f"{label}_bodies"] = tuple(model.body(body).name for body in bodies)
+        spheres[f"{label}s"] = spheres_on_links(of_kind, body_link, body_in_link)
+        geoms_of_kind[label] = geoms
+        spheres[f"{label}_bodies"] = tuple(model.body(body).name for body in of_kind.body)
+    # The first body of the base gives link 0 its name.
     base = next((b for b in range(1, model.nbody) if body_link[b] == 0), 0)
     link_bodies = [base, *model.jnt_bodyid]
     return Robot(
@@ -169,7 +198,9 @@ def _robot(*, model: mujoco.MjModel, **fields) -> Robot:
         upper=upper,
         is_continuous=model.jnt_limited == 0,
         home=model.key_qpos[0].copy(),
-        self_collision_pairs=pairs.checked_pairs(model),
-        **labels,
+        self_collision_pairs=self_collision.checked_pairs(
+            model, geoms_of_kind["self_collision_sphere"]
+        ),
+        **spheres,
         **fields,
     )

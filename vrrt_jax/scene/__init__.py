@@ -1,1 +1,1 @@
-"""A robot among obstacles: what is free, and the last word of C MuJoCo."""
+"""A robot among obstacles: what is free, and the independent check with C MuJoCo."""

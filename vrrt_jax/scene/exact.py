@@ -10,19 +10,13 @@ import numpy as np
 from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 from vrrt_jax.robots.robot import Robot
+from vrrt_jax.scene.obstacle_kinds import KINDS
 from vrrt_jax.scene.obstacles import Obstacle
 
-_KINDS = {
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "plane": mujoco.mjtGeom.mjGEOM_PLANE,
-}
 _GEOMETRIES = ("auto", "meshes", "spheres")
-_ALL_BITS = 0x7FFFFFFF
-_SAME_ROBOT = 1e-3  # [m] between the body frames of meshes and of spheres at home
-_OTHER_VERSION = "install the version of the meshes that the README names"
+_ALL_BITS = 0x7FFFFFFF  # contact bits of obstacles that everything sees
+_FRAME_TOLERANCE = 1e-3  # [m] between the body frames of meshes and of spheres at home
+_INSTALL_ADVICE = "install the version of the meshes that the README names"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,18 +40,20 @@ class ExactScene:
         return sorted({(int(first), int(second)) for first, second in bodies})
 
     def clearance(self, best: float) -> float:
-        """Distance between moving geoms and obstacles where ``touching`` was last asked [m].
+        """Distance [m] of moving geoms to obstacles, at the latest argument of :meth:`touching`.
 
         Args:
-            best: no larger distance is of interest [m]; the closer it is, the faster.
+            best: larger distances are not computed [m]; the smaller it is, the faster.
         """
         model, data = self.model, self.data
+        # Lower bounds from bounding spheres, so that few pairs need their exact distance.
         apart = data.geom_xpos[self.robot_geoms][:, None] - data.geom_xpos[self.obstacle_geoms]
         bound = np.linalg.norm(apart, axis=-1) - model.geom_rbound[self.obstacle_geoms]
         is_plane = model.geom_type[self.obstacle_geoms] == mujoco.mjtGeom.mjGEOM_PLANE
         normal = data.geom_xmat[self.obstacle_geoms].reshape(-1, 3, 3)[:, :, 2]
         height = np.einsum("rkd,kd->rk", apart, normal)
         bound = np.where(is_plane, height, bound) - model.geom_rbound[self.robot_geoms, None]
+        # Nearest bounds first: once a bound is beyond the best distance, so are all after it.
         for index in np.argsort(bound, axis=None):
             if bound.flat[index] >= best:
                 break
@@ -97,7 +93,7 @@ def exact_scene(
 
 
 def _hashable(obstacle: Obstacle) -> Obstacle:
-    """The obstacle with tuples of floats, whatever it was made of, and without its color."""
+    """The obstacle with tuples of floats, whatever it was made of, and the default color."""
     x, y, z = (float(value) for value in obstacle.position)
     qw, qx, qy, qz = (float(value) for value in obstacle.quaternion)
     a, b, c = (float(value) for value in obstacle.size)
@@ -118,6 +114,7 @@ def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> Exac
             f"the meshes of robot '{robot.name}' are not on this machine: pip install "
             f"{install_hint(robot.mesh_source)}, or use geometry='spheres'"
         )
+    # True meshes where they are to be had, else the covering spheres.
     has_meshes = spec is not None
     spheres = mujoco.MjSpec.from_string(robot.xml)
     spec = spec or spheres
@@ -126,7 +123,7 @@ def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> Exac
         _exclude(spec, robot.ignored_pairs)
     num_bodies = len(spec.bodies)
     for obstacle in obstacles:
-        # spheres of the robot see bit 0 only, so that its thin ones ignore obstacles
+        # Collision spheres see bit 0 only, and self-collision spheres see no obstacle.
         _add_obstacle(spec, obstacle, _ALL_BITS if has_meshes else 1)
     spec.memory = 1 << 23  # room for the contacts of a robot deep inside an obstacle
     try:
@@ -136,10 +133,11 @@ def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> Exac
         raise ValueError(
             f"the obstacles do not compile: {reason}; expected sizes as in MJCF, positive"
         ) from None
+    # Which geoms are measured against each other for the clearance.
     is_obstacle = model.geom_bodyid >= num_bodies
     sees_obstacles = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     if not has_meshes:
-        sees_obstacles = model.geom_group == int(mjcf_writer.COVER["group"])
+        sees_obstacles = model.geom_group == int(mjcf_writer.COLLISION_GEOM["group"])
     is_moving = model.body_weldid[model.geom_bodyid] != 0
     return ExactScene(
         model=model,
@@ -156,8 +154,9 @@ def _check_same_robot(robot: Robot, meshes: mujoco.MjModel, spheres: mujoco.MjMo
     if meshes.nq != robot.num_joints:
         raise ValueError(
             f"the meshes of robot '{robot.name}' have {meshes.nq} joints; expected "
-            f"{robot.num_joints}: {_OTHER_VERSION}"
+            f"{robot.num_joints}: {_INSTALL_ADVICE}"
         )
+    # Positions of all bodies at home, by name.
     frames = []
     for model in (meshes, spheres):
         data = mujoco.MjData(model)
@@ -171,38 +170,37 @@ def _check_same_robot(robot: Robot, meshes: mujoco.MjModel, spheres: mujoco.MjMo
     if missing:
         raise ValueError(
             f"the meshes of robot '{robot.name}' have no body {', '.join(sorted(missing))}; have: "
-            f"{', '.join(frames[0])}: {_OTHER_VERSION}"
+            f"{', '.join(frames[0])}: {_INSTALL_ADVICE}"
         )
     error = max(
         np.max(np.abs(position - frames[1][name]))
         for name, position in frames[0].items()
         if name in frames[1]
     )
-    if error > _SAME_ROBOT:
+    if error > _FRAME_TOLERANCE:
         raise ValueError(
             f"the meshes of robot '{robot.name}' are placed {error:.4f} m away from its collision "
-            f"spheres; expected the same kinematics: {_OTHER_VERSION}"
+            f"spheres; expected the same kinematics: {_INSTALL_ADVICE}"
         )
 
 
-def _exclude(spec: mujoco.MjSpec, allowed: Sequence[tuple[str, str]]) -> None:
+def _exclude(spec: mujoco.MjSpec, ignored_pairs: Sequence[tuple[str, str]]) -> None:
     names = {body.name for body in spec.bodies}
-    for first, second in allowed:
+    for first, second in ignored_pairs:
         if first in names and second in names:
             spec.add_exclude(bodyname1=first, bodyname2=second)
 
 
 def _add_obstacle(spec: mujoco.MjSpec, obstacle: Obstacle, bits: int) -> None:
     """Add an obstacle as a body of its own, so that contacts can name it."""
-    if obstacle.kind not in _KINDS:
+    if obstacle.kind not in KINDS:
         raise ValueError(
             f"obstacle '{obstacle.name}' is a '{obstacle.kind}'; expected one of: "
-            f"{', '.join(_KINDS)}"
+            f"{', '.join(KINDS)}"
         )
-    size = np.array(obstacle.size)
-    if obstacle.kind == "plane":
-        size[2] = 1.0  # the spacing of the grid that is drawn; zero does not compile
+    kind = KINDS[obstacle.kind]
     body = spec.worldbody.add_body(
         name=f"obstacle: {obstacle.name}", pos=obstacle.position, quat=obstacle.quaternion
     )
-    body.add_geom(type=_KINDS[obstacle.kind], size=size, contype=bits, conaffinity=bits)
+    size = kind.geom_size(obstacle.size)
+    body.add_geom(type=kind.geom, size=size, contype=bits, conaffinity=bits)

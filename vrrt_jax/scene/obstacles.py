@@ -1,8 +1,7 @@
 """Obstacles: slots on the device, primitive geoms on the host.
 
-Every kind is one formula, a box with optional rounding and an optional round section: a sphere is a
-rounded point, a capsule a rounded segment, a cylinder a box of round section and a floor a very
-large box. So any slot holds any kind.
+Every kind is one formula, a box with optional rounding and an optional round section, so that any
+slot holds any kind; :mod:`vrrt_jax.scene.obstacle_kinds` has the table of kinds.
 """
 
 import dataclasses
@@ -16,10 +15,9 @@ import mujoco
 import numpy as np
 
 from vrrt_jax.core.types import pytree
+from vrrt_jax.scene.obstacle_kinds import KINDS, SlotShape
 
-KINDS = ("sphere", "box", "capsule", "cylinder", "plane")
 PARKED = 1e3  # [m] where the empty slots are
-HALF_SPACE = 50.0  # [m] half the edge of the box that stands for a plane
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -27,7 +25,7 @@ class Obstacle:
     """An obstacle as the host sees it: one primitive geom of an MJCF file."""
 
     name: str
-    kind: str  # sphere, box, capsule, cylinder or plane
+    kind: str  # one of ``obstacle_kinds.KINDS``: sphere, box, capsule, cylinder or plane
     position: tuple[float, float, float]  # in the world [m]
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # wxyz
     size: tuple[float, float, float] = (0.0, 0.0, 0.0)  # as MuJoCo's geom size [m]
@@ -47,15 +45,18 @@ class Obstacles:
 
 def signed_distances(obstacles: Obstacles, points: jax.Array) -> jax.Array:
     """Exact distances (n, K) [m] from points (3, n) to obstacles, negative inside."""
+    # Into each obstacle's frame, axis by axis: XLA's CPU backend is slow on small products.
     offset = points[:, :, None] - obstacles.position.T[:, None]
     x, y, z = (
         sum(offset[i] * obstacles.rotation[:, i, axis] for i in range(3)) for axis in range(3)
     )
+    # How far outside the faces. A round section has one face all around, at the radius half_x.
     half_x, half_y, half_z = obstacles.half.T
     radial = jnp.sqrt(x * x + y * y + 1e-20)
     x = jnp.where(obstacles.is_round, radial, jnp.abs(x)) - half_x
     y = jnp.where(obstacles.is_round, -half_x, jnp.abs(y) - half_y)
     z = jnp.abs(z) - half_z
+    # Outside: the distance to the nearest face, edge or corner. Inside: to the nearest face.
     outside = sum(jnp.maximum(axis, 0.0) ** 2 for axis in (x, y, z))
     inside = jnp.minimum(jnp.maximum(x, jnp.maximum(y, z)), 0.0)
     return jnp.sqrt(outside + 1e-20) + inside - obstacles.rounding
@@ -115,21 +116,14 @@ def to_slots(obstacles: Sequence[Obstacle], num_slots: int) -> Obstacles:
     is_round = np.zeros(num_slots, bool)
     for k, obstacle in enumerate(obstacles):
         check_obstacle(obstacle)
-        matrix, (a, b, c) = np.zeros(9), obstacle.size
+        kind = KINDS[obstacle.kind]
+        matrix = np.zeros(9)
         unit = np.asarray(obstacle.quaternion) / np.linalg.norm(obstacle.quaternion)
         mujoco.mju_quat2Mat(matrix, unit)
         rotation[k], position[k] = matrix.reshape(3, 3), obstacle.position
-        if obstacle.kind == "sphere":
-            rounding[k] = a
-        elif obstacle.kind == "box":
-            half[k] = a, b, c
-        elif obstacle.kind == "capsule":
-            half[k, 2], rounding[k] = b, a
-        elif obstacle.kind == "cylinder":
-            half[k], is_round[k] = (a, a, b), True
-        else:
-            half[k] = HALF_SPACE
-            position[k] -= HALF_SPACE * rotation[k][:, 2]
+        position[k] += kind.shift * rotation[k][:, 2]
+        shape = kind.encode(obstacle.size)
+        half[k], rounding[k], is_round[k] = shape.half, shape.rounding, shape.is_round
     return Obstacles(
         position=jnp.asarray(position, jnp.float32),
         rotation=jnp.asarray(rotation, jnp.float32),
@@ -139,6 +133,41 @@ def to_slots(obstacles: Sequence[Obstacle], num_slots: int) -> Obstacles:
     )
 
 
+def from_slots(obstacles: Obstacles, kinds: Sequence[str]) -> list[dict[str, Any] | None]:
+    """What the slots say about each obstacle: the reverse of :func:`to_slots`.
+
+    Args:
+        obstacles: K slots.
+        kinds: (K,) the kind in each slot, '' where it is empty.
+
+    Returns:
+        For each slot, None or the fields kind, position, quaternion and size of an
+        :class:`Obstacle`.
+    """
+    slots = jax.tree.map(np.asarray, obstacles)
+    found: list[dict[str, Any] | None] = []
+    for k, name in enumerate(kinds):
+        if not name:
+            found.append(None)
+            continue
+        kind, quaternion = KINDS[name], np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, slots.rotation[k].astype(np.float64).ravel())
+        shape = SlotShape(
+            half=slots.half[k],
+            rounding=float(slots.rounding[k]),
+            is_round=bool(slots.is_round[k]),
+        )
+        found.append(
+            {
+                "kind": name,
+                "position": floats(slots.position[k] - kind.shift * slots.rotation[k][:, 2]),
+                "quaternion": floats(quaternion),
+                "size": floats(kind.decode(shape)),
+            }
+        )
+    return found
+
+
 def check_obstacle(obstacle: Obstacle) -> None:
     """Raise a ValueError that names the obstacle if it cannot be collided with."""
     if obstacle.kind not in KINDS:
@@ -146,9 +175,9 @@ def check_obstacle(obstacle: Obstacle) -> None:
             f"collision between the robot's spheres and '{obstacle.name}' ({obstacle.kind}) is not "
             f"supported; use one of {', '.join(KINDS)}"
         )
-    needed = {"sphere": 1, "box": 3, "capsule": 2, "cylinder": 2, "plane": 0}[obstacle.kind]
     if not (np.all(np.isfinite(obstacle.position)) and np.all(np.isfinite(obstacle.quaternion))):
         raise ValueError(f"obstacle '{obstacle.name}' has a pose that is not finite")
+    needed = KINDS[obstacle.kind].num_sizes
     size = np.asarray(obstacle.size[:needed])
     if not np.all(np.isfinite(size) & (size > 0)):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""How well spheres stand for the true geometry: misses and false alarms in C MuJoCo."""
+"""How well spheres agree with the true geometry: misses and false alarms in C MuJoCo."""
 
 import dataclasses
 
@@ -8,10 +8,10 @@ from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.exact import ExactScene, exact_scene
 from vrrt_jax.scene.obstacles import Obstacle
 
-_SCENES = 20
+_SCENES = 20  # random scenes that the configurations are spread over
 _KINDS = ("box", "sphere", "capsule", "cylinder") * 2
-_REACH = 0.9  # of the largest distance of a link from the base: where obstacles stand
-_KEEP_OUT = 0.25  # of it: free around the base
+_MAX_DISTANCE = 0.9  # of the arm's reach: obstacles stand inside
+_MIN_DISTANCE = 0.25  # of the arm's reach: free around the base
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -63,6 +63,7 @@ def measure_spheres(robot: Robot, num: int = 10_000, seed: int = 0) -> SphereRep
     rows: list[list[bool]] = []
     missed: dict[tuple[str, str], int] = {}
     for scene in np.array_split(np.arange(num), _SCENES):
+        # One scene twice: with the true geometry, and with the spheres.
         obstacles = _random_obstacles(rng, reach)
         truth = exact_scene(robot, obstacles, geometry="meshes")
         spheres = exact_scene(robot, obstacles, geometry="spheres")
@@ -117,9 +118,9 @@ def _random_obstacles(rng: np.random.Generator, reach: float) -> list[Obstacle]:
     obstacles = []
     while len(obstacles) < len(_KINDS):
         position = rng.uniform([-1, -1, 0], [1, 1, 1]) * reach
-        if not _KEEP_OUT * reach < np.linalg.norm(position[:2]):
+        if not _MIN_DISTANCE * reach < np.linalg.norm(position[:2]):
             continue
-        if np.linalg.norm(position) > _REACH * reach:
+        if np.linalg.norm(position) > _MAX_DISTANCE * reach:
             continue
         quaternion = rng.normal(size=4)
         index = len(obstacles)

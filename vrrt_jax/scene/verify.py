@@ -1,7 +1,7 @@
-"""The last word on a path: C MuJoCo, the true meshes, fine steps.
+"""The independent check of a path: C MuJoCo, the true meshes, fine steps.
 
-Independent of MJX and of the distances that the planner computes, so that an error there cannot
-hide itself.
+Nothing here shares code with MJX or with the distances that the planner computes, so that an error
+there cannot hide itself.
 """
 
 from collections.abc import Sequence
@@ -30,14 +30,14 @@ def verify_path(
 ) -> Verification:
     """Check a path for limits, collision and self-collision.
 
-    The fixed base may touch anything; every other link may touch nothing but its neighbors. Pairs
-    of links that never touch in thousands of random configurations, or nearly always, are left out.
+    The fixed base may touch anything. Every other link may touch its neighbors only. Pairs of links
+    that never touch in thousands of random configurations, or nearly always, are not checked.
 
     Args:
         robot: from :func:`vrrt_jax.robots.load_robot`.
         obstacles: K primitives.
-        path: (P, D) way-points, joined by straight lines, the short way round for joints that wrap
-            [rad] or [m]; half a turn goes the way that the numbers tell.
+        path: (P, D) configurations joined by straight lines [rad] or [m]. Joints that wrap take the
+            shorter direction. A turn by exactly pi follows the sign of the difference.
         step: largest distance between checked configurations [rad] (Euclidean over joints).
         geometry: "meshes" for the true collision geometry, "spheres" for the robot's covering
             spheres, "auto" for meshes where this machine has them.
@@ -51,6 +51,7 @@ def verify_path(
         raise ValueError(f"step is {step}; expected a positive number [rad], such as 0.005")
     exact = exact_scene(robot, obstacles, geometry=geometry)
     configurations, fractions = interpolate(robot, path, step)
+    # Contacts are asked for up to the first configuration outside the limits.
     outside = _outside_limits(robot, configurations)
     first_outside = int(outside.any(1).argmax()) if outside.any() else len(configurations)
     clearance, contact, checked = np.inf, None, 0
@@ -132,9 +133,10 @@ def _checked_path(robot: Robot, path: np.ndarray) -> np.ndarray:
 def interpolate(robot: Robot, path: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Configurations (n, D) along the path, ends included, and their share (n,) of its length."""
     turns = np.diff(path, axis=0)
-    # Half a turn, but for rounding, goes the way that is written.
+    # Turns by more than pi take the shorter direction. A turn by pi, up to rounding, does not.
     around = robot.is_continuous & (np.abs(turns) > np.pi + _HALF_TURN_TOLERANCE)
     turns -= 2 * np.pi * np.round(turns / (2 * np.pi)) * around
+    # Each segment is divided into equal steps; the first configuration is the path's first.
     lengths = np.linalg.norm(turns, axis=1)
     rows, traveled = [path[:1]], [np.zeros(1)]
     for start, turn, before, length in zip(

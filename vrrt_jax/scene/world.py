@@ -1,92 +1,74 @@
-"""Robot and obstacles as arrays, and the question every planner asks: is this configuration free?
+"""A robot among obstacles, and the question every planner asks: is this configuration free?
 
-Obstacles live in slots, so that moving, adding or removing them never re-compiles. Distances are
-exact and smooth, whereas MJX's collision functions give only a sign for boxes and cost many times
-as much; :mod:`vrrt_jax.scene.mjx` checks one against the other.
+Here is the interface, :class:`World`. An engine is a subclass that answers it:
+:mod:`vrrt_jax.scene.closed_form` is the one that :func:`build_world` chooses. Obstacles live in
+slots, so that moving, adding or removing them never re-compiles.
 """
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from vrrt_jax.core.edges import StraightLineEdges
-from vrrt_jax.core.types import TraceIgnoredNames, pytree, static
-from vrrt_jax.robots.kinematics import Chain, Spheres, link_poses, place, placement
-from vrrt_jax.scene.obstacles import (
-    HALF_SPACE,
-    Obstacle,
-    Obstacles,
-    floats,
-    signed_distances,
-    to_slots,
-)
+from vrrt_jax.core.types import PytreeSubclasses, TraceIgnoredNames, pytree, static
+from vrrt_jax.robots.kinematics import Chain
+from vrrt_jax.scene.obstacles import Obstacle, Obstacles, floats, from_slots, to_slots
 
 
 @pytree
-class World(StraightLineEdges):
-    """All that planners ask about robot and obstacles."""
+class World(PytreeSubclasses, StraightLineEdges):
+    """All that planners ask about robot and obstacles.
+
+    Subclass an engine's world to add a constraint of your own: planners ask :meth:`is_free` only.
+    Subclasses are pytree dataclasses by themselves, so that new fields may be arrays.
+
+    Letters: ``D`` joints, ``K`` obstacle slots.
+    """
 
     chain: Chain
-    collision_spheres: (
-        jax.Array
-    )  # (L * 12, 3 n) placement of the covering spheres, against obstacles
-    collision_radius: jax.Array  # (n,) [m]
-    self_collision_spheres: (
-        jax.Array
-    )  # (L * 12, 3 m) placement of the thinner spheres, against each other
-    contact_distance: (
-        jax.Array
-    )  # (m, m) distance at which two of them touch, 0 for pairs not checked [m]
     obstacles: Obstacles
-    lower: jax.Array  # (D,)
-    upper: jax.Array  # (D,)
+    lower: jax.Array  # (D,) [rad] or [m]
+    upper: jax.Array  # (D,) [rad] or [m]
     is_continuous: jax.Array  # (D,) bool, joints that turn for ever
     margin: jax.Array  # () clearance asked of obstacles [m]
     resolution: jax.Array  # () longest sub-step of an edge between two checks [rad]
     joint_names: TraceIgnoredNames = static()
     obstacle_names: TraceIgnoredNames = static()  # (K,) '' in empty slots
-    kinds: TraceIgnoredNames = static()  # (K,)
-    colors: TraceIgnoredNames = static()  # (K,)
+    kinds: TraceIgnoredNames = static()  # (K,) '' in empty slots
+    colors: TraceIgnoredNames = static()  # (K,) rgba, () in empty slots
 
     def is_free(self, q: jax.Array) -> jax.Array:
-        """See :func:`is_free`."""
-        return is_free(self, q)
+        """See :func:`is_free`; for engines to answer."""
+        raise NotImplementedError
 
+    def obstacle_clearance(self, q: jax.Array) -> jax.Array:
+        """See :func:`obstacle_clearance`; for engines to answer."""
+        raise NotImplementedError
 
-def obstacle_clearance(world: World, q: jax.Array) -> jax.Array:
-    """Distance () [m] of the covering spheres at ``q`` (D,) to the nearest obstacle."""
-    return _clearance(world, link_poses(world.chain, q))
+    def with_margin(self, margin: float) -> Self:
+        """See :func:`with_margin`."""
+        return dataclasses.replace(self, margin=self.margin + margin)
 
 
 def is_free(world: World, q: jax.Array) -> jax.Array:
-    """Whether ``q`` (D,) touches neither an obstacle nor itself, () bool; limits are not looked at.
+    """Whether ``q`` (D,) touches neither an obstacle nor the robot itself, () bool.
 
-    Pure and vmappable; fast inside any ``jit``.
+    Limits are not checked. Pure and vmappable; fast inside any ``jit``. This is ``world.is_free``,
+    so that a subclass that overrides it is obeyed.
     """
-    poses = link_poses(world.chain, q)
-    return (_clearance(world, poses) > world.margin) & (_self_gap(world, poses) >= 0)
+    return world.is_free(q)
 
 
 batch_is_free = jax.jit(jax.vmap(is_free, (None, 0)))  # of q (n, D), for the host
 
 
-def _clearance(world: World, poses: jax.Array) -> jax.Array:
-    distances = signed_distances(world.obstacles, place(world.collision_spheres, poses))
-    return jnp.min(distances - world.collision_radius[:, None])
-
-
-def _self_gap(world: World, poses: jax.Array) -> jax.Array:
-    """Smallest difference () of squared distance and squared reach [m^2]."""
-    centers = place(world.self_collision_spheres, poses)
-    apart = sum((axis[:, None] - axis[None]) ** 2 for axis in centers)
-    return jnp.min(
-        apart - world.contact_distance**2, initial=jnp.inf
-    )  # few links have no pair to check
+def obstacle_clearance(world: World, q: jax.Array) -> jax.Array:
+    """Distance () [m] of the collision spheres at ``q`` (D,) to the nearest obstacle."""
+    return world.obstacle_clearance(q)
 
 
 def build_world(
@@ -115,28 +97,25 @@ def build_world(
             f"margin={margin} and resolution={resolution}: expected margin >= 0 m and "
             "resolution > 0 rad"
         )
-    reach = np.zeros((len(robot.self_collision_spheres.radius),) * 2, np.float32)
-    thin_radius = np.asarray(robot.self_collision_spheres.radius)
-    first, second = np.asarray(robot.self_collision_pairs, int).reshape(-1, 2).T
-    reach[first, second] = thin_radius[first] + thin_radius[second]
+    # Engines build on this module, so that it cannot import them at its top.
+    from vrrt_jax.scene.closed_form import closed_form_world
+
+    # Slots in multiples of eight: worlds of about the same size share their compiled functions.
     num_slots = 8 * max(-(-num_slots // 8), -(-len(obstacles) // 8), 1)
-    world = World(
-        chain=robot.chain,
-        collision_spheres=_placement(robot.collision_spheres, robot.chain),
-        collision_radius=robot.collision_spheres.radius,
-        self_collision_spheres=_placement(robot.self_collision_spheres, robot.chain),
-        contact_distance=jnp.asarray(reach),
-        obstacles=to_slots([], num_slots),
-        lower=jnp.asarray(robot.lower, jnp.float32),
-        upper=jnp.asarray(robot.upper, jnp.float32),
-        is_continuous=jnp.asarray(robot.is_continuous, bool),
-        margin=jnp.float32(margin),
-        resolution=jnp.float32(resolution),
-        joint_names=TraceIgnoredNames(robot.joint_names),
-        obstacle_names=TraceIgnoredNames([""] * num_slots),
-        kinds=TraceIgnoredNames([""] * num_slots),
-        colors=TraceIgnoredNames([()] * num_slots),
-    )
+    fields = {
+        "chain": robot.chain,
+        "obstacles": to_slots([], num_slots),
+        "lower": jnp.asarray(robot.lower, jnp.float32),
+        "upper": jnp.asarray(robot.upper, jnp.float32),
+        "is_continuous": jnp.asarray(robot.is_continuous, bool),
+        "margin": jnp.float32(margin),
+        "resolution": jnp.float32(resolution),
+        "joint_names": TraceIgnoredNames(robot.joint_names),
+        "obstacle_names": TraceIgnoredNames([""] * num_slots),
+        "kinds": TraceIgnoredNames([""] * num_slots),
+        "colors": TraceIgnoredNames([()] * num_slots),
+    }
+    world = closed_form_world(robot, fields)
     return with_obstacles(world, obstacles)
 
 
@@ -169,40 +148,15 @@ def with_obstacles(world: World, obstacles: Sequence[Obstacle]) -> World:
 
 def with_margin(world: World, margin: float) -> World:
     """The same world, where the robot keeps ``margin`` [m] farther from obstacles and itself."""
-    reach = jnp.where(world.contact_distance > 0, world.contact_distance + margin, 0.0)
-    return dataclasses.replace(world, margin=world.margin + margin, contact_distance=reach)
+    return world.with_margin(margin)
 
 
 def obstacle_list(world: World) -> list[Obstacle]:
     """The obstacles in the world's slots, as the host sees them."""
-    slots = jax.tree.map(np.asarray, world.obstacles)
-    found = []
-    for k, (name, kind) in enumerate(zip(world.obstacle_names, world.kinds, strict=True)):
-        if not kind:
-            continue
-        half, rounding, quaternion = slots.half[k], float(slots.rounding[k]), np.zeros(4)
-        mujoco.mju_mat2Quat(quaternion, slots.rotation[k].astype(np.float64).ravel())
-        position = slots.position[k]
-        if kind == "plane":
-            position = position + HALF_SPACE * slots.rotation[k][:, 2]
-        size = {
-            "sphere": (rounding, 0.0, 0.0),
-            "box": half,
-            "capsule": (rounding, half[2], 0.0),
-            "cylinder": (half[0], half[2], 0.0),
-            "plane": (0.0, 0.0, 1.0),
-        }[kind]
-        found.append(
-            Obstacle(
-                name=name,
-                kind=kind,
-                position=floats(position),
-                quaternion=floats(quaternion),
-                size=floats(size),
-                rgba=world.colors[k],
-            )
-        )
-    return found
+    slots = zip(
+        from_slots(world.obstacles, world.kinds), world.obstacle_names, world.colors, strict=True
+    )
+    return [Obstacle(name=name, rgba=rgba, **fields) for fields, name, rgba in slots if fields]
 
 
 def move_obstacle(
@@ -237,11 +191,6 @@ def move_obstacle(
     )
 
 
-def _placement(spheres: Spheres, chain: Chain) -> jax.Array:
-    matrix = placement(np.asarray(spheres.link), np.asarray(spheres.center), chain.num_links)
-    return jnp.asarray(matrix)
-
-
 def overrides_is_free(world: World) -> bool:
     """Whether a subclass has an ``is_free`` of its own, which the exact check does not know."""
-    return type(world).is_free is not World.is_free
+    return not type(world).is_free.__module__.startswith("vrrt_jax.scene")

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 import mujoco
 import numpy as np
 
+from vrrt_jax.scene.obstacle_kinds import KINDS
 from vrrt_jax.scene.obstacles import Obstacle
 from vrrt_jax.splat.types import Camera
 
@@ -45,10 +46,10 @@ class MeshRenderer:
         for obstacle in obstacles:
             spec.worldbody.add_geom(
                 name=f"obstacle {obstacle.name}",
-                type=getattr(mujoco.mjtGeom, f"mjGEOM_{obstacle.kind.upper()}"),
+                type=KINDS[obstacle.kind].geom,
                 pos=obstacle.position,
                 quat=obstacle.quaternion,
-                size=obstacle.size,
+                size=KINDS[obstacle.kind].geom_size(obstacle.size),
                 rgba=obstacle.rgba,
                 group=OBSTACLE_GROUP,
             )

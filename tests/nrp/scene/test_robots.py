@@ -1,7 +1,5 @@
 """The snake and the Fetch: kinematics, limits, and spheres that cover their primitives."""
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -9,7 +7,6 @@ import numpy as np
 import pytest
 
 import nrp_jax
-from nrp_jax.scene.robots import cover_geom
 from vrrt_jax.robots.kinematics import batch_link_poses, link_poses
 
 
@@ -69,26 +66,6 @@ def test_straight_arm_of_the_fetch():
     np.testing.assert_allclose(gripper, [1.128, 0.0, 0.886], atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("kind", "size"),
-    [("BOX", (0.06, 0.0125, 0.0)), ("BOX", (0.06, 0.066, 0.044)), ("CAPSULE", (0.06, 0.1, 0))],
-)
-def test_spheres_cover_their_geom(rng, kind, size):
-    size = np.array(size, float)
-    center, radius = cover_geom(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"), size, 0.03)
-    if kind == "BOX":
-        points = rng.uniform(-size, size, (5000, 3))
-        corners = size * np.array(list(itertools.product((-1, 1), repeat=3)))
-        points = np.concatenate([points, corners])
-    else:
-        ball = rng.normal(size=(5000, 3))
-        ball *= size[0] / np.linalg.norm(ball, axis=1, keepdims=True)
-        points = ball + np.outer(rng.uniform(-size[1], size[1], 5000), [0, 0, 1])
-    gap = np.linalg.norm(points[:, None] - center, axis=2) - radius
-    assert gap.min(axis=1).max() < 1e-9
-    assert radius.max() < np.sort(size)[-2] + 0.04
-
-
 def test_cover_contains_the_primitives_at_any_configuration(robot, rng):
     """Surface points of MuJoCo's geoms lie inside the spheres, or in the round base."""
     from nrp_jax.viz import _outer_points
@@ -117,7 +94,7 @@ def test_cover_contains_the_primitives_at_any_configuration(robot, rng):
 
 def test_only_links_of_one_layer_of_the_snake_are_checked():
     snake = nrp_jax.load_robot("snake")
-    assert sorted(snake.plates.pairs) == [(0, 2), (0, 4), (1, 3), (1, 5), (2, 4), (3, 5)]
+    assert sorted(snake.planar_boxes.pairs) == [(0, 2), (0, 4), (1, 3), (1, 5), (2, 4), (3, 5)]
 
 
 def test_share_of_postures_that_hit_themselves(rng):

@@ -14,6 +14,7 @@ from nrp_jax.bench.checks import SphereLoop
 from nrp_jax.homes.grid import coarsened, load_map
 from nrp_jax.scene.exact import ExactScene, merge_cells
 from nrp_jax.scene.field import clearance_bound, make_field
+from nrp_jax.scene.world import CarWorld
 from vrrt_jax.core.edges import free_prefix
 from vrrt_jax.core.planners.rrt import sample_configurations
 
@@ -69,7 +70,7 @@ def test_no_collision_is_missed(worlds, name):
     free = np.asarray(nrp_jax.batch_is_free(world, q))
     loop, scene = SphereLoop(robot, grid), ExactScene(robot, grid)
     by_loop = np.array([loop.is_free(row) for row in q])
-    by_mujoco = np.array([scene.touching(row) is None for row in q])
+    by_mujoco = np.array([not scene.touching(row) for row in q])
     assert 0.03 < free.mean() < 0.9
     assert not np.any(free & ~by_loop)
     assert not np.any(free & ~by_mujoco)
@@ -83,10 +84,10 @@ def test_planar_boxes_stand_where_the_snake_is():
     grid = nrp_jax.Grid(occupied=occupied, origin=(0.0, 0.0, -2.0))
     scene = ExactScene(nrp_jax.load_robot("snake"), grid)
     q = np.array([1.0, 1.0, 0.6, 1.0, -0.8, 1.0, -0.8, 0.9])
-    assert scene.touching(q) is None
+    assert not scene.touching(q)
     for x in (2.1, 4.1):  # the wall, and what is beside the map
         q[0] = x
-        assert "touches the map" in (scene.touching(q) or "")
+        assert "touches the map" in scene.describe(scene.touching(q)[0])
 
 
 def test_rates_of_fewer_configurations_than_a_batch(worlds, monkeypatch):
@@ -345,3 +346,42 @@ def test_maps_from_elsewhere_load(name):
     world = nrp_jax.build_world(nrp_jax.load_robot("snake"), grid)
     q = sample_configurations(world, jax.random.key(0), 1500)
     assert 0.05 < float(np.mean(nrp_jax.batch_is_free(world, q))) < 0.6
+
+
+class KeepOut(nrp_jax.GridWorld):
+    """A home where the base must keep away from a place."""
+
+    keep_out: jax.Array  # (2,) [m]
+
+    def is_free(self, q):
+        return super().is_free(q) & (jnp.linalg.norm(q[:2] - self.keep_out) > 1.0)
+
+
+class CarKeepOut(CarWorld):
+    """The same for a base that drives like a car."""
+
+    keep_out: jax.Array  # (2,) [m]
+
+    def is_free(self, q):
+        return super().is_free(q) & (jnp.linalg.norm(q[:2] - self.keep_out) > 1.0)
+
+
+@pytest.mark.parametrize(("name", "kind"), [("snake", KeepOut), ("fetch", CarKeepOut)])
+def test_a_subclass_is_obeyed_by_every_function(worlds, rng, name, kind):
+    _, grid, world = worlds[name]
+    place = np.array(grid.origin[:2]) + grid.size[:2] / 2
+    zone = kind(**vars(world), keep_out=jnp.asarray(place, jnp.float32))
+    q = np.asarray(sample_configurations(world, jax.random.key(0), 2048))
+    outside = np.linalg.norm(q[:, :2] - place, axis=1) > 1.0
+    before = np.asarray(nrp_jax.batch_is_free(world, q))  # compiled for the world it extends
+    expected = before & outside
+    assert before.sum() > expected.sum() > 0
+    np.testing.assert_array_equal(nrp_jax.batch_is_free(zone, q), expected)
+    np.testing.assert_array_equal(jax.vmap(zone.is_free)(jnp.asarray(q)), expected)
+    assert not bool(nrp_jax.is_free(zone, jnp.asarray(q[np.argmax(before & ~outside)])))
+    # The kernel stops at the zone, and so do its edges.
+    start, inside = q[np.argmax(expected)][None], q[np.argmax(before & ~outside)][None]
+    edge = zone.edge(jnp.asarray(start), jnp.asarray(inside))
+    steps = int(free_prefix(zone, jnp.asarray(start), edge, 64)[0])
+    assert steps < 64
+    assert isinstance(nrp_jax.with_grid(zone, grid), kind)

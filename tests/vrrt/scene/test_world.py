@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -5,9 +7,12 @@ import numpy as np
 import pytest
 
 import vrrt_jax
+from vrrt_jax.core.types import pytree
+from vrrt_jax.robots.kinematics import batch_link_poses, link_poses
+from vrrt_jax.scene.closed_form import ClosedFormWorld
 from vrrt_jax.scene.mjx import mjx_is_free, mjx_world
 from vrrt_jax.scene.obstacles import load_obstacles, signed_distances
-from vrrt_jax.scene.world import with_margin
+from vrrt_jax.scene.world import World, batch_is_free, with_margin
 
 DISTANCE_TOLERANCE = 2e-5  # [m]; worst seen 4e-6, near a plane drawn as a 100 m box
 
@@ -170,3 +175,75 @@ def test_world_files(tmp_path):
         load_obstacles(file)
     with pytest.raises(FileNotFoundError, match="cannot read the world"):
         load_obstacles(tmp_path / "nowhere.xml")
+
+
+class KeepOut(ClosedFormWorld):
+    """A world where the hand must keep away from a point."""
+
+    keep_out: jax.Array  # (3,) [m]
+
+    def is_free(self, q):
+        hand = link_poses(self.chain, q)[-1, :3, 3]
+        return super().is_free(q) & (jnp.linalg.norm(hand - self.keep_out) > 0.4)
+
+
+@pytest.fixture
+def keep_out(wall_world):
+    return KeepOut(**vars(wall_world), keep_out=jnp.array([0.4, 0.0, 0.5]))
+
+
+def test_a_subclass_is_obeyed_by_every_function(panda, wall_world, keep_out, free, rng):
+    q = rng.uniform(panda.lower, panda.upper, (512, 7)).astype(np.float32)
+    hand = np.asarray(batch_link_poses(panda.chain, jnp.asarray(q)))[:, -1, :3, 3]
+    outside = np.linalg.norm(hand - np.array([0.4, 0.0, 0.5]), axis=1) > 0.4
+    before = np.asarray(batch_is_free(wall_world, q))  # compiled for the world it extends
+    expected = before & outside
+    assert before.sum() > expected.sum() > 0
+    np.testing.assert_array_equal(batch_is_free(keep_out, q), expected)
+    np.testing.assert_array_equal(free(keep_out, q), expected)
+    np.testing.assert_array_equal(jax.vmap(keep_out.is_free)(jnp.asarray(q)), expected)
+    assert bool(vrrt_jax.is_free(keep_out, jnp.asarray(q[np.argmax(expected)])))
+    blocked = q[np.argmax(before & ~outside)]
+    assert not bool(vrrt_jax.is_free(keep_out, jnp.asarray(blocked)))
+    with pytest.raises(ValueError, match="the start is in collision"):
+        vrrt_jax.plan_to_configuration(
+            panda, keep_out, blocked, q[np.argmax(expected)], key=jax.random.key(0)
+        )
+
+
+def test_a_subclass_stays_itself(keep_out):
+    changed = (with_margin(keep_out, 0.1), vrrt_jax.with_obstacles(keep_out, []))
+    for world in (*changed, vrrt_jax.move_obstacle(keep_out, "ball", position=(0, 0, 2))):
+        assert isinstance(world, KeepOut)
+        np.testing.assert_array_equal(world.keep_out, keep_out.keep_out)
+
+
+def test_a_new_zone_does_not_retrace(keep_out):
+    traces = []
+
+    @jax.jit
+    def ask(world, q):
+        traces.append(1)
+        return vrrt_jax.is_free(world, q)
+
+    ask(keep_out, jnp.zeros(7))
+    ask(dataclasses.replace(keep_out, keep_out=jnp.array([9.0, 9.0, 9.0])), jnp.zeros(7))
+    assert len(traces) == 1
+
+
+def test_the_decorator_is_optional_for_subclasses(wall_world):
+    @pytree
+    class Decorated(ClosedFormWorld):
+        height: jax.Array
+
+    for kind, extra in ((Decorated, {"height": jnp.float32(1.0)}), (KeepOut, None)):
+        extra = extra or {"keep_out": jnp.zeros(3)}
+        world = kind(**vars(wall_world), **extra)
+        assert isinstance(jax.jit(lambda world: world)(world), kind)
+
+
+def test_an_engine_must_answer(wall_world):
+    names = [field.name for field in dataclasses.fields(World)]
+    world = World(**{name: getattr(wall_world, name) for name in names})
+    with pytest.raises(NotImplementedError):
+        vrrt_jax.is_free(world, jnp.zeros(7))

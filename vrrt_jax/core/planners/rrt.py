@@ -9,7 +9,7 @@ import numpy as np
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import Space
 from vrrt_jax.core.goal import ConfigurationGoal
-from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
+from vrrt_jax.core.types import Expansion, Proposals, PytreeSubclasses, Tree, pytree, static
 
 
 def sample_configurations(world: Space, key: jax.Array, num: int) -> jax.Array:
@@ -20,7 +20,7 @@ def sample_configurations(world: Space, key: jax.Array, num: int) -> jax.Array:
 
 
 @pytree
-class RRT:
+class RRT(PytreeSubclasses):
     """Single-tree RRT (LaValle 1998): extend the nearest node towards a random configuration.
 
     A node's score is its distance to the goal.

@@ -1,4 +1,7 @@
-"""Cover a body with few spheres that stick out little where obstacles could be.
+"""Fit few spheres to a body, which stick out little where obstacles could be; takes minutes.
+
+The command ``vrrt spheres`` fits with it. Robots are loaded with the quick covers of
+:mod:`vrrt_jax.robots.sphere_cover`.
 
 The spheres of a body minimize the volume of false alarms: places for the center of a ball-shaped
 obstacle that touches a sphere but not the robot. They are found by gradient descent from several
@@ -50,6 +53,7 @@ def sample_bodies(
     trees = {body: KDTree(points) for body, points in surfaces.items()}
     samples = {}
     for body, own in pieces.items():
+        # To be covered: mostly surface, and some of the interior, so that nothing fits inside.
         interior = _box_points(surfaces[body], 0.0, 20 * _NUM_INTERIOR, rng)
         interior = interior[union_depth(own, interior) > 0][:_NUM_INTERIOR]
         surface = rng.permutation(surfaces[body])[: _NUM_INSIDE - len(interior)]
@@ -133,10 +137,12 @@ def fit_body(
     starts = [_start(samples.inside, num, rng) for _ in range(_STARTS)]
     centers = np.zeros((_STARTS, MAX_SPHERES, 3))
     radii = np.full((_STARTS, MAX_SPHERES), -1.0)  # unused: far from everything
+    # One compiled descent serves any number of spheres: the spare ones have no effect.
     for k, (center, radius) in enumerate(starts):
         centers[k, :num], radii[k, :num] = center, radius
     arrays = (samples.outside, samples.ball, samples.inside)
     fitted = _descend(centers, radii, num, *(jnp.asarray(a, jnp.float32) for a in arrays))
+    # Of all starts keep the one with the least false alarms, once every sample is covered.
     best = (np.inf, np.zeros((num, 3)), np.zeros(num))
     for center, radius in zip(*(np.asarray(a, np.float64)[:, :num] for a in fitted), strict=True):
         inside = np.linalg.norm(samples.inside[:, None] - center, axis=-1)
@@ -151,6 +157,7 @@ def _start(points: np.ndarray, num: int, rng: np.random.Generator) -> tuple[np.n
     """Spheres around the clusters that k-means finds."""
     points = points[rng.choice(len(points), 800)]
     centers = points[rng.choice(len(points), num, replace=False)]
+    # Lloyd's iterations of k-means.
     for _ in range(15):
         nearest = np.linalg.norm(points[:, None] - centers, axis=-1).argmin(1)
         for k in np.unique(nearest):
@@ -180,6 +187,7 @@ def _descend(
         return jnp.min(jnp.where(used, gap, jnp.inf), axis=-1)
 
     def loss(spheres, progress):
+        # Soft counts of false alarms, which get sharper, and a penalty on bare points, which grows.
         width = 0.006 * (1 - progress) + 0.0015 * progress
         alarms = jnp.mean(jax.nn.sigmoid((ball - distance(spheres, outside)) / width))
         bare = jax.nn.relu(distance(spheres, inside) + 3e-4) / 1e-3

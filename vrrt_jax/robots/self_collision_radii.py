@@ -1,6 +1,6 @@
-"""Self-collision: how thick the spheres of each body should be."""
+"""How large the self-collision spheres of a robot should be."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -10,51 +10,55 @@ import optax
 
 from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.convex_parts import STEP
-from vrrt_jax.robots.pairs import SelfCollisions, checked_pairs
+from vrrt_jax.robots.kinematics import BodySpheres
+from vrrt_jax.robots.self_collision import SelfCollisions, checked_pairs
 
 _MISS_COST = 20.0  # false alarms that one missed self-collision is worth
 _STEPS = 600
 _SHRINK = 0.007  # [m] to start with: covering spheres stick out by about twice as much
-_LEAST = 0.3  # of its first radius: no sphere gets thinner
-_NEAREST = 32  # pairs of spheres looked at in one configuration
-_MAX_ROWS = 10_000
+_MIN_SHARE = 0.3  # of its first radius: no sphere gets smaller
+_NEAREST = 32  # pairs of spheres considered in one configuration
+_MAX_ROWS = 10_000  # configurations that the radii are fitted to
 _NEAR = 0.005  # [m] free configurations with more room between spheres teach nothing
 
 
-def refine(
+def fit_radii(
     model: mujoco.MjModel,
-    spheres: mjcf_writer.BodySpheres,
-    found: SelfCollisions,
-    allowed: list[tuple[str, str]],
+    spheres: BodySpheres,
+    sample: SelfCollisions,
+    ignored_pairs: Sequence[tuple[str, str]],
     write: Callable[..., str],
-) -> mjcf_writer.BodySpheres:
+) -> BodySpheres:
     """Give covering spheres radii that agree with the true geometry in self-collision.
 
     Args:
         model: the robot with its true geometry.
         spheres: to start from, on all bodies and sorted by body.
-        found: random configurations of ``model``.
-        allowed: pairs of bodies that may touch.
-        write: :func:`vrrt_jax.robots.mjcf_writer.collision_mjcf` but for ``thin`` and ``allowed``.
+        sample: random configurations of ``model``.
+        ignored_pairs: pairs of bodies that may touch.
+        write: :func:`vrrt_jax.robots.mjcf_writer.collision_mjcf` but for ``self_collision`` and
+            ``ignored_pairs``.
 
     Returns:
-        Those of the spheres that are checked against any other, with new radii.
+        The spheres that are checked against any other, with new radii.
     """
-    banned = {(model.body(first).id, model.body(second).id) for first, second in allowed}
-    truth = np.array([bool(touching - banned) for touching in found.touching])
-    draft = mujoco.MjModel.from_xml_string(write(thin=spheres, allowed=allowed))
-    radii, is_used = _fit_radii(draft, found.q, truth)
-    return mjcf_writer.BodySpheres(
+    ignored = {(model.body(first).id, model.body(second).id) for first, second in ignored_pairs}
+    truth = np.array([bool(touching - ignored) for touching in sample.touching])
+    draft = mujoco.MjModel.from_xml_string(
+        write(self_collision=spheres, ignored_pairs=ignored_pairs)
+    )
+    radii, is_used = _fit_to(draft, sample.q, truth)
+    return BodySpheres(
         body=spheres.body[is_used],
         center=spheres.center[is_used],
         radius=np.round(radii[is_used] / STEP) * STEP,
     )
 
 
-def _fit_radii(
+def _fit_to(
     draft: mujoco.MjModel, configurations: np.ndarray, truth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Radii with which thin spheres touch where the true geometry does.
+    """Radii with which self-collision spheres touch where the true geometry does.
 
     Args:
         draft: the collision model, with radii to start from.
@@ -64,23 +68,24 @@ def _fit_radii(
     Returns:
         Radii (n,) [m]; (n,) bool, which spheres are checked against any other.
     """
-    geoms = np.flatnonzero(draft.geom_group == int(mjcf_writer.THIN["group"]))
+    geoms = np.flatnonzero(draft.geom_group == int(mjcf_writer.SELF_COLLISION_GEOM["group"]))
     start = draft.geom_size[geoms, 0]
-    pairs = checked_pairs(draft)
+    pairs = checked_pairs(draft, geoms)
     is_used = np.isin(np.arange(len(geoms)), pairs)
     if not (len(pairs) and truth.any()):
         return start, is_used
     data = mujoco.MjData(draft)
-    reach = start[pairs].sum(1)
-    nearest = min(_NEAREST, len(pairs))
+    contact_distance = start[pairs].sum(1)
+    num_nearest = min(_NEAREST, len(pairs))
     rows, indices, labels = [], [], []
     for q, is_colliding in zip(configurations, truth, strict=True):
         data.qpos[:] = q
         mujoco.mj_kinematics(draft, data)
         centers = data.geom_xpos[geoms]
         apart = np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1)
-        if is_colliding or np.max(reach - apart) > -_NEAR:
-            first = np.argpartition(apart - reach, nearest - 1)[:nearest]
+        # Only collisions and near misses say something about the radii.
+        if is_colliding or np.max(contact_distance - apart) > -_NEAR:
+            first = np.argpartition(apart - contact_distance, num_nearest - 1)[:num_nearest]
             rows.append(apart[first].astype(np.float32))
             indices.append(pairs[first])
             labels.append(is_colliding)
@@ -98,9 +103,10 @@ def _descend(
     optimizer = optax.adam(optax.cosine_decay_schedule(5e-4, _STEPS, 0.02))
 
     def radii_of(shrink):
-        return jnp.maximum(start - shrink, _LEAST * start)
+        return jnp.maximum(start - shrink, _MIN_SHARE * start)
 
     def loss(shrink, progress):
+        # A soft count of errors, which gets sharper as the descent goes on.
         width = 0.004 * (1 - progress) + 0.0008
         depth = jnp.max(jnp.sum(radii_of(shrink)[pairs], axis=-1) - apart, axis=1)
         missed = _MISS_COST * jax.nn.sigmoid((5e-4 - depth) / width)

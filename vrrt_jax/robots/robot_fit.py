@@ -5,14 +5,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vrrt_jax.robots import cover, mjcf_writer, thin
+from vrrt_jax.robots import mjcf_writer, sphere_fit
 from vrrt_jax.robots.convex_parts import collision_pieces, contain_surface
+from vrrt_jax.robots.kinematics import BodySpheres
 from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
-from vrrt_jax.robots.pairs import allowed_pairs, sample_self_collisions
 from vrrt_jax.robots.robot import Robot
+from vrrt_jax.robots.self_collision import find_ignored_pairs, sample_self_collisions
+from vrrt_jax.robots.self_collision_radii import fit_radii
 
 _CONFIGURATIONS = 100_000  # for self-collision
-_LEAF = 3e-4  # [m]
+_LEAF = 3e-4  # [m] size of the smallest triangle when the cover is proven
 
 
 def fit_spheres(
@@ -25,9 +27,9 @@ def fit_spheres(
 ) -> str:
     """Fit spheres anew; takes some minutes.
 
-    Cover spheres contain every point of the surface of the moving bodies, so that no contact with
-    an obstacle is missed. Thin spheres have centers of these and some in the base, and radii that
-    agree best with the true geometry in self-collision.
+    Collision spheres contain every point of the surface of the moving bodies, so that no contact
+    with an obstacle is missed. Self-collision spheres have the same centers, and some in the base.
+    Their radii agree best with the true geometry in self-collision.
 
     Args:
         robot: its kinematics and home are kept, its spheres are not used.
@@ -52,31 +54,32 @@ def fit_spheres(
     model = spec.compile()
     rng = np.random.default_rng(seed)
     pieces = collision_pieces(model)
-    samples = cover.sample_bodies(model, pieces, rng)
+    samples = sphere_fit.sample_bodies(model, pieces, rng)
     moving = [body for body in pieces if model.body_weldid[body]]
     progress(f"fitting {num_spheres} spheres to {len(moving)} moving bodies")
     fitted = _share_out({body: samples[body] for body in moving}, num_spheres, rng, progress)
     for body in pieces:
         if body not in moving:
-            fitted[body] = cover.fit_body(samples[body], num_base_spheres, rng)[:2]
+            fitted[body] = sphere_fit.fit_body(samples[body], num_base_spheres, rng)[:2]
+    # The descent saw samples only: grow the spheres until they provably contain the surface.
     proven = {
         body: contain_surface(pieces[body], *fitted[body], leaf=_LEAF) for body in sorted(fitted)
     }
-    found = sample_self_collisions(model, _CONFIGURATIONS, rng)
-    allowed = allowed_pairs(model, found)
+    sample = sample_self_collisions(model, _CONFIGURATIONS, rng)
+    ignored_pairs = find_ignored_pairs(model, sample)
     write = functools.partial(
         mjcf_writer.collision_mjcf,
         model,
         name=robot.name,
-        cover=_collect({body: proven[body] for body in moving}),
+        collision=_collect({body: proven[body] for body in moving}),
         home=robot.home,
         mesh_source=robot.mesh_source,
         frozen=robot.frozen,
         comment=_comment(robot.name, num_spheres, num_base_spheres, seed),
     )
-    thin_spheres = thin.refine(model, _collect(proven), found, allowed, write)
-    progress(f"{len(thin_spheres.body)} spheres take part in self-collision")
-    return write(thin=thin_spheres, allowed=allowed)
+    self_collision = fit_radii(model, _collect(proven), sample, ignored_pairs, write)
+    progress(f"{len(self_collision.body)} spheres take part in self-collision")
+    return write(self_collision=self_collision, ignored_pairs=ignored_pairs)
 
 
 def _comment(name: str, num_spheres: int, num_base_spheres: int, seed: int) -> str:
@@ -90,8 +93,8 @@ def _comment(name: str, num_spheres: int, num_base_spheres: int, seed: int) -> s
 """
 
 
-def _collect(spheres: dict[int, tuple[np.ndarray, np.ndarray]]) -> mjcf_writer.BodySpheres:
-    return mjcf_writer.BodySpheres(
+def _collect(spheres: dict[int, tuple[np.ndarray, np.ndarray]]) -> BodySpheres:
+    return BodySpheres(
         body=np.repeat(list(spheres), [len(radii) for _, radii in spheres.values()]),
         center=np.vstack([centers for centers, _ in spheres.values()]),
         radius=np.hstack([radii for _, radii in spheres.values()]),
@@ -99,7 +102,7 @@ def _collect(spheres: dict[int, tuple[np.ndarray, np.ndarray]]) -> mjcf_writer.B
 
 
 def _share_out(
-    samples: dict[int, cover.BodySamples],
+    samples: dict[int, sphere_fit.BodySamples],
     num_spheres: int,
     rng: np.random.Generator,
     progress: Callable[[str], None],
@@ -110,7 +113,7 @@ def _share_out(
             f"num_spheres is {num_spheres}; expected at least one for each of the {len(samples)} "
             "moving bodies"
         )
-    found = {body: [cover.fit_body(own, 1, rng)] for body, own in samples.items()}
+    found = {body: [sphere_fit.fit_body(own, 1, rng)] for body, own in samples.items()}
     used = dict.fromkeys(samples, 1)
     while sum(used.values()) < num_spheres:
         gains = {}
@@ -118,10 +121,10 @@ def _share_out(
             # two more at once may help where one more does not: rings, bent links
             for more in (1, 2):
                 count = used[body] + more
-                if count > cover.MAX_SPHERES or sum(used.values()) + more > num_spheres:
+                if count > sphere_fit.MAX_SPHERES or sum(used.values()) + more > num_spheres:
                     continue
                 if count > len(found[body]):
-                    found[body].append(cover.fit_body(own, count, rng))
+                    found[body].append(sphere_fit.fit_body(own, count, rng))
                 saved = found[body][used[body] - 1][2] - found[body][count - 1][2]
                 gains[body, more] = saved / more
         if not gains:

@@ -1,4 +1,4 @@
-"""Which spheres of a robot are checked against each other."""
+"""Self-collision: which bodies of a robot touch, and which spheres are checked for it."""
 
 import collections
 import dataclasses
@@ -6,32 +6,35 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.mjcf import joint_ranges
 
-_NUM_DRAFT = 500
-_ALWAYS = 0.98  # a pair of bodies that touches more often than this is allowed to
+_NUM_DRAFT = 500  # configurations in which a draft of spheres is checked
+_ALWAYS = 0.98  # a pair of bodies that touches in a larger share of configurations is ignored
 
 
-def checked_pairs(model: mujoco.MjModel) -> np.ndarray:
-    """Pairs of thin spheres that C MuJoCo checks in a collision model.
+def checked_pairs(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
+    """Pairs of geoms that C MuJoCo checks for contact, by its own rules.
 
     Args:
-        model: compiled from :func:`vrrt_jax.robots.mjcf_writer.collision_mjcf`.
+        model: a compiled robot.
+        geoms: (n,) indices of geoms. A geom that several spheres stand for may come several times.
 
     Returns:
-        (P, 2) i32 indices among the thin spheres, in the order of the geoms.
+        (P, 2) i32 indices into ``geoms``, the smaller one first.
     """
-    geoms = np.flatnonzero(model.geom_group == int(mjcf_writer.THIN["group"]))
-    body = model.geom_bodyid[geoms]
     first, second = np.triu_indices(len(geoms), 1)
+    # The contact bits of the two geoms must meet.
+    types, affinities = model.geom_contype[geoms], model.geom_conaffinity[geoms]
+    do_bits_meet = (types[first] & affinities[second]) | (types[second] & affinities[first])
+    # Bodies welded together are one. A parent and its child touch at the joint, and are left out
+    # unless the parent is the base.
+    body = model.geom_bodyid[geoms]
     weld = model.body_weldid[body]
     parent = model.body_weldid[model.body_parentid[weld]]
     a, b = weld[first], weld[second]
-    # as in MuJoCo: a parent and its child touch at the joint, unless the parent is the base
     is_adjacent = ((a == parent[second]) | (b == parent[first])) & (a != 0) & (b != 0)
-    banned = np.isin(_signature(body[first], body[second]), model.exclude_signature)
-    keep = (a != b) & ~is_adjacent & ~banned
+    is_excluded = np.isin(_signature(body[first], body[second]), model.exclude_signature)
+    keep = (do_bits_meet != 0) & (a != b) & ~is_adjacent & ~is_excluded
     return np.stack([first[keep], second[keep]], -1).astype(np.int32)
 
 
@@ -75,48 +78,48 @@ def sample_self_collisions(
     return SelfCollisions(q=q, touching=touching)
 
 
-def _count(found: SelfCollisions) -> dict[tuple[int, int], int]:
+def _count(sample: SelfCollisions) -> dict[tuple[int, int], int]:
     """How often each pair of bodies touches."""
-    return collections.Counter(pair for pairs in found.touching for pair in pairs)
+    return collections.Counter(pair for pairs in sample.touching for pair in pairs)
 
 
-def allowed_pairs(model: mujoco.MjModel, found: SelfCollisions) -> list[tuple[str, str]]:
+def find_ignored_pairs(model: mujoco.MjModel, sample: SelfCollisions) -> list[tuple[str, str]]:
     """Pairs of bodies that need no check: they never touch, or nearly always do.
 
     A body and the base that carries it are among them: they share a joint.
 
     Args:
         model: the robot with its true geometry.
-        found: random configurations.
+        sample: random configurations.
     """
-    count = _count(found)
+    count = _count(sample)
     bodies = np.unique(model.geom_bodyid)
     weld = model.body_weldid
-    allowed = []
+    ignored = []
     for a, b in ((int(a), int(b)) for a in bodies for b in bodies if a < b):
         parents = weld[model.body_parentid[weld[[a, b]]]]
-        # C MuJoCo skips these by itself
+        # Bodies welded together, and neighbors along the chain: C MuJoCo skips them by itself.
         if weld[a] == weld[b] or (weld[a] and weld[b] and weld[b] == parents[0]):
             continue
         if weld[a] and weld[b] and weld[a] == parents[1]:
             continue
         is_joined = weld[a] == 0 and parents[1] == 0
-        if is_joined or not 0 < count.get((a, b), 0) < _ALWAYS * len(found.q):
-            allowed.append((model.body(a).name, model.body(b).name))
-    return allowed
+        if is_joined or not 0 < count.get((a, b), 0) < _ALWAYS * len(sample.q):
+            ignored.append((model.body(a).name, model.body(b).name))
+    return ignored
 
 
 def always_touching(model: mujoco.MjModel) -> list[tuple[str, str]]:
-    """Pairs of bodies whose thin spheres touch at home, or nearly everywhere.
+    """Pairs of bodies whose self-collision spheres touch at home, or nearly everywhere.
 
     Args:
         model: compiled from :func:`vrrt_jax.robots.mjcf_writer.collision_mjcf`.
     """
-    found = sample_self_collisions(model, _NUM_DRAFT, np.random.default_rng(0))
+    sample = sample_self_collisions(model, _NUM_DRAFT, np.random.default_rng(0))
     data = mujoco.MjData(model)
     data.qpos[:] = model.key_qpos[0]
     pairs = touching_bodies(model, data) | {
-        pair for pair, times in _count(found).items() if times > _ALWAYS * _NUM_DRAFT
+        pair for pair, times in _count(sample).items() if times > _ALWAYS * _NUM_DRAFT
     }
     return [(model.body(first).name, model.body(second).name) for first, second in sorted(pairs)]
 

@@ -1,4 +1,4 @@
-"""Spheres contain what they stand for, and do not claim_output_dir much more."""
+"""Spheres contain what they stand for, and do not claim much more."""
 
 import dataclasses
 
@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from vrrt_jax.robots import convex_parts, cover, fit, load_robot, mesh_sources, spheres
+from vrrt_jax.robots import convex_parts, load_robot, mesh_sources, robot_fit, sphere_fit
+from vrrt_jax.robots.robot_spheres import spheres_of
 from vrrt_jax.scene.sphere_errors import measure_spheres
 
 # Bounds on false alarms, against obstacles and itself; measured at 10,000 configurations, seed 0:
@@ -56,8 +57,8 @@ def true_model(robot):
 
 
 def uncovered(model, bodies, robot, rng):
-    """Largest distance [m] of a surface point of the model from the robot's cover spheres."""
-    found = spheres.spheres_of(mujoco.MjModel.from_xml_string(robot.xml)).cover
+    """Largest distance [m] of a surface point of the model from the robot's collision spheres."""
+    found = spheres_of(mujoco.MjModel.from_xml_string(robot.xml)).collision
     own = mujoco.MjModel.from_xml_string(robot.xml)
     worst = -np.inf
     for body, shape in convex_parts.collision_pieces(model).items():
@@ -102,11 +103,11 @@ def test_spheres_fitted_on_loading_contain_the_geometry(arm, rng):
 
 
 def test_fit_spheres_writes_a_robot(arm, tmp_path, monkeypatch, rng):
-    monkeypatch.setattr(fit, "_CONFIGURATIONS", 2000)
+    monkeypatch.setattr(robot_fit, "_CONFIGURATIONS", 2000)
     for name, value in (("_STARTS", 2), ("_STEPS", 100), ("_NUM_OUTSIDE", 600)):
-        monkeypatch.setattr(cover, name, value)
+        monkeypatch.setattr(sphere_fit, name, value)
     lines = []
-    xml = fit.fit_spheres(arm, num_spheres=5, num_base_spheres=2, progress=lines.append)
+    xml = robot_fit.fit_spheres(arm, num_spheres=5, num_base_spheres=2, progress=lines.append)
     assert lines
     path = tmp_path / "fitted.xml"
     path.write_text(xml)
@@ -119,75 +120,16 @@ def test_fit_spheres_writes_a_robot(arm, tmp_path, monkeypatch, rng):
     report = measure_spheres(robot, num=1000, seed=1)
     assert report.obstacles.misses == 0
     with pytest.raises(ValueError, match="num_spheres is 1; expected at least one for each of"):
-        fit.fit_spheres(arm, num_spheres=1)
+        robot_fit.fit_spheres(arm, num_spheres=1)
 
 
 def test_meshes_are_needed_to_fit_and_to_measure(panda, monkeypatch):
     monkeypatch.setenv("MENAGERIE_ROOT", "")
     monkeypatch.setattr(mesh_sources.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match="cannot fit spheres: the meshes of robot 'panda'"):
-        fit.fit_spheres(panda)
+        robot_fit.fit_spheres(panda)
     with pytest.raises(ValueError, match="meshes of robot 'panda' are not on this machine"):
         measure_spheres(panda, num=20, seed=99)
-
-
-def test_piece_contains_every_round_geom():
-    """The polytope around a sphere, a capsule, a cylinder and an ellipsoid contains it."""
-    sizes = {"sphere": "0.1", "capsule": "0.1 0.2", "cylinder": "0.1 0.2", "ellipsoid": ".1 .2 .3"}
-    geoms = "".join(
-        f'<body pos="0 0 {k}"><geom type="{kind}" size="{size}"/></body>'
-        for k, (kind, size) in enumerate(sizes.items())
-    )
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>")
-    directions = np.random.default_rng(0).normal(size=(4000, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    ends = np.sign(directions[:, 2:]) * [[0, 0, 0.2]]
-    rim = np.hstack([directions[:, :2] / np.linalg.norm(directions[:, :2], axis=1)[:, None], ends])
-    surfaces = {
-        "sphere": 0.1 * directions,
-        "capsule": 0.1 * directions + ends,
-        "cylinder": np.stack([0.1 * rim[:, 0], 0.1 * rim[:, 1], ends[:, 2]], -1),
-        "ellipsoid": directions * [0.1, 0.2, 0.3],
-    }
-    for (body, (piece,)), kind in zip(
-        convex_parts.collision_pieces(model).items(), sizes, strict=True
-    ):
-        depth = piece.depth(surfaces[kind])
-        assert depth.min() > -1e-9, kind
-        assert depth.min() < 0.026 * 0.3, (body, kind)
-
-
-def test_grow_takes_the_worst_point_in_by_the_nearest_sphere():
-    distance = np.array([[1.0, 3.0], [2.0, 5.5], [5.0, 4.0]])
-    np.testing.assert_allclose(convex_parts.grow(distance, np.array([1.0, 1.0])), [2.0, 4.0])
-    np.testing.assert_allclose(convex_parts.grow(distance, np.array([5.0, 1.0])), [5.0, 1.0])
-
-
-def test_contain_surface_closes_every_gap(rng):
-    """Two balls in a box, far too small: they grow until the box is inside."""
-    box = convex_parts.piece_of(rng.uniform(-0.1, 0.1, (60, 3)))
-    centers, radii = convex_parts.contain_surface(
-        [box], np.array([[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0]]), np.full(2, 0.05), leaf=1e-3
-    )
-    surface = convex_parts.surface_samples([box], 0.001, rng)
-    gap = np.linalg.norm(surface[:, None] - centers, axis=-1) - radii
-    assert gap.min(1).max() <= 0
-    assert radii.max() < 0.2
-
-
-def test_descent_beats_its_starts(rng):
-    """Three spheres around a bar: fitted ones stick out less than those of the greedy cover."""
-    bar = convex_parts.piece_of(
-        np.stack(np.meshgrid([-0.15, 0.15], [-0.04, 0.04], [-0.04, 0.04]), -1).reshape(-1, 3)
-    )
-    xml = '<mujoco><worldbody><body><joint/><geom size=".1"/></body></worldbody></mujoco>'
-    model = mujoco.MjModel.from_xml_string(xml)
-    samples = cover.sample_bodies(model, {1: [bar]}, rng)[1]
-    _, _, alarms = cover.fit_body(samples, 3, rng)
-    # no three spheres of one radius on the axis do better than sqrt(0.05^2 + 2 * 0.04^2)
-    centers = np.array([[-0.1, 0, 0], [0, 0, 0], [0.1, 0, 0]])
-    gap = np.linalg.norm(samples.outside[:, None] - centers, axis=-1) - np.sqrt(0.0057)
-    assert alarms < 1.05 * np.sum(gap.min(1) < samples.ball) * samples.cell
 
 
 def test_report_counts(arm):

@@ -1,0 +1,147 @@
+"""A robot on a sliding base among the solid cells of a home: is this configuration free?"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from nrp_jax.scene.field import DistanceField, clearance_bound
+from nrp_jax.scene.robots import PlanarBoxes
+from vrrt_jax.core.edges import StraightLineEdges, joint_steps
+from vrrt_jax.core.types import PytreeSubclasses, pytree, static
+from vrrt_jax.robots.kinematics import Chain, link_poses, place
+
+
+@pytree
+class RoundBase:
+    """A round base among the cells that are low enough to be in its way."""
+
+    field: DistanceField  # planar
+    radius: jax.Array  # () [m]
+    height: jax.Array  # () [m]
+    link: int = static()
+
+
+@pytree
+class GridWorld(PytreeSubclasses, StraightLineEdges):
+    """What planners ask about a robot on a sliding base in a home; edges are straight.
+
+    An edge's length is the base's length plus ``arm_weight`` times the arm's length. Its sub-steps
+    move no joint by more than ``resolution``.
+
+    Subclass it to add a constraint of your own: planners ask :meth:`is_free` only. Subclasses are
+    pytree dataclasses by themselves, so that new fields may be arrays.
+
+    Letters: ``D`` joints with the base's, ``n`` collision spheres, ``L`` links.
+    """
+
+    chain: Chain
+    collision_spheres: jax.Array  # (L * 12, 3 n) their placement, see ``kinematics.placement``
+    collision_radius: jax.Array  # (n,) [m]
+    floor: jax.Array  # (n,) lowest height of their centers, -inf if they may touch the floor [m]
+    planar_boxes: PlanarBoxes | None  # flat links checked against each other, instead of spheres
+    # (m, n) distances at which the last m spheres touch the others, 0 for pairs not checked [m]
+    contact_distance: jax.Array
+    base: RoundBase | None
+    field: DistanceField
+    lower: jax.Array  # (D,) [rad] or [m]
+    upper: jax.Array  # (D,) [rad] or [m]
+    is_continuous: jax.Array  # (D,) bool, joints that turn for ever
+    arm_weight: jax.Array  # () meters that a radian of the arm counts for
+    resolution: jax.Array  # () longest sub-step of any joint [m] or [rad]
+
+    def is_free(self, q: jax.Array) -> jax.Array:
+        """See :func:`nrp_jax.scene.world.is_free`."""
+        poses = link_poses(self.chain, q)
+        # The barrier keeps XLA's CPU fusions from placing the spheres once for every use.
+        centers = jax.lax.optimization_barrier(place(self.collision_spheres, poses))
+        # Self-collision: only the last m of n spheres have partners, see ``contact_distance``.
+        first = self.contact_distance.shape[1] - self.contact_distance.shape[0]
+        apart = sum((axis[first:, None] - axis) ** 2 for axis in centers)
+        free = jnp.all(apart >= self.contact_distance**2)
+        # The home and its floor.
+        free &= jnp.all(clearance_bound(self.field, centers) > self.collision_radius)
+        free &= jnp.all(centers[2] > self.floor)
+        # Parts of the robot that are not spheres.
+        if self.planar_boxes is not None:
+            free &= _boxes_apart(self.planar_boxes, poses)
+        if self.base is not None:
+            free &= _base_is_free(self.base, poses, centers, self.collision_radius, self.floor)
+        return free
+
+    def interpolate(self, q_a: jax.Array, q_b: jax.Array, fraction: jax.Array) -> jax.Array:
+        """Configurations (..., D) at a fraction (...) of the edges between others (..., D)."""
+        part = self.truncate(self.edge(q_a, q_b), jnp.asarray(fraction, q_a.dtype))
+        return self.normalize(self.end(q_a, part))
+
+    def distances(self, nodes: jax.Array, q: jax.Array, among: jax.Array) -> jax.Array:
+        """See :class:`vrrt_jax.core.edges.Space`."""
+        base, arm = jnp.zeros((2, q.shape[0], nodes.shape[0]), q.dtype)
+        for joint in range(q.shape[1]):
+            squared = joint_steps(self, nodes, q, joint) ** 2
+            base, arm = (base + squared, arm) if joint < 2 else (base, arm + squared)
+        return jnp.where(among, jnp.sqrt(base) + self.arm_weight * jnp.sqrt(arm), jnp.inf)
+
+    def length(self, edge: jax.Array) -> jax.Array:
+        """See :class:`vrrt_jax.core.edges.Space`."""
+        return norm(edge[..., :2]) + self.arm_weight * norm(edge[..., 2:])
+
+    def span(self, edge: jax.Array) -> jax.Array:
+        """The longest distance (...) that any joint moves along an edge [m] or [rad]."""
+        return jnp.max(jnp.abs(edge), axis=-1)
+
+    def steer(self, q_from: jax.Array, target: jax.Array, num_steps: int) -> jax.Array:
+        """See :class:`vrrt_jax.core.edges.Space`."""
+        inside = jnp.where(self.is_continuous, target, jnp.clip(target, self.lower, self.upper))
+        edge = self.edge(q_from, inside)
+        longest = num_steps * self.resolution
+        return self.truncate(edge, jnp.minimum(1.0, longest / jnp.maximum(self.span(edge), 1e-9)))
+
+    def is_resolved(self, edge: jax.Array, num_steps: int | jax.Array) -> jax.Array:
+        """See :class:`vrrt_jax.core.edges.Space`."""
+        return self.span(edge) <= num_steps * self.resolution * (1 + 1e-5)
+
+    def parts(self, edge: Any, most: int) -> jax.Array:
+        """Fewest parts (...) of an edge that are resolved each; ``most + 1`` if it takes more."""
+        enough = jax.vmap(self.is_resolved, (None, 0))(edge, jnp.arange(1, most + 1))
+        return 1 + jnp.sum(~enough, axis=0)
+
+
+def norm(step: jax.Array) -> jax.Array:
+    """Euclidean length (...) of steps (..., D)."""
+    return jnp.sqrt(jnp.sum(step**2, axis=-1))
+
+
+def _boxes_apart(boxes: PlanarBoxes, poses: jax.Array) -> jax.Array:
+    """Whether no two of the checked boxes overlap: some side separates them."""
+    # Centers and headings of the boxes in the world.
+    pose = poses[jnp.array(boxes.link)]
+    cosine, sine = pose[:, 0, 0], pose[:, 1, 0]
+    center = jnp.einsum("mij,mj->mi", pose[:, :2, :2], boxes.center) + pose[:, :2, 3]
+    pairs = jnp.array(boxes.pairs).T
+    (c_i, c_j), (s_i, s_j), (half_i, half_j) = cosine[pairs], sine[pairs], boxes.half[pairs]
+    # |cos| and |sin| of the angle between the two boxes of a pair: how far one reaches along the
+    # sides of the other.
+    turned = jnp.abs(jnp.stack([c_i * c_j + s_i * s_j, c_i * s_j - s_i * c_j]))
+    dx, dy = (center[pairs[1]] - center[pairs[0]]).T
+    # Separating axes: the two directions of each box's sides.
+    apart = jnp.zeros(len(boxes.pairs), bool)
+    for (c, s), own, other in (((c_i, s_i), half_i, half_j), ((c_j, s_j), half_j, half_i)):
+        ahead, beside = jnp.abs(c * dx + s * dy), jnp.abs(c * dy - s * dx)
+        apart |= ahead > own[:, 0] + other[:, 0] * turned[0] + other[:, 1] * turned[1]
+        apart |= beside > own[:, 1] + other[:, 0] * turned[1] + other[:, 1] * turned[0]
+    return jnp.all(apart)
+
+
+def _base_is_free(
+    base: RoundBase, poses: jax.Array, centers: jax.Array, radius: jax.Array, floor: jax.Array
+) -> jax.Array:
+    """Whether a cylinder touches neither a cell nor the spheres that must not touch the floor."""
+    # Gap of each sphere's center to the cylinder, beside it and above it.
+    position = poses[base.link, :3, 3:]
+    beside = jnp.sqrt(jnp.sum((centers[:2] - position[:2]) ** 2, axis=0)) - base.radius
+    above = centers[2] - base.height
+    gap = jnp.maximum(beside, 0.0) ** 2 + jnp.maximum(above, 0.0) ** 2
+    return (clearance_bound(base.field, position)[0] > base.radius) & jnp.all(
+        (gap > radius**2) | jnp.isinf(floor)
+    )

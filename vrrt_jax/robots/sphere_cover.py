@@ -1,0 +1,192 @@
+"""Cover geoms with spheres, as a robot is loaded.
+
+There are two coverings, because the two packages ask for different things.
+
+* :func:`cover_primitives` divides a box into bricks and a capsule into slices. It is exact and
+  regular: the same geom always gives the same spheres, and no random number is drawn. It knows
+  spheres, capsules and boxes only. The mobile robots of :mod:`nrp_jax` are made of these.
+* :func:`cover_convex_parts` takes any collision geom, meshes too, as convex pieces. It chooses
+  spheres one by one, each time the one that covers most of what is still bare. It needs far fewer
+  spheres than bricks would. Robots from a file that does not bring spheres are loaded with it.
+
+Neither can replace the other without new spheres for robots that planners were tuned or trained
+with. Both return :class:`vrrt_jax.robots.kinematics.BodySpheres`.
+
+This module is not :mod:`vrrt_jax.robots.sphere_fit`, which spends minutes on the best spheres for
+the command ``vrrt spheres``.
+"""
+
+import mujoco
+import numpy as np
+
+from vrrt_jax.robots.convex_parts import (
+    Piece,
+    collision_pieces,
+    contain_surface,
+    surface_samples,
+    union_depth,
+)
+from vrrt_jax.robots.kinematics import BodySpheres
+
+_SURFACE_SPACING = 0.004  # [m] between surface samples
+_MAX_SURFACE_POINTS = 2000  # of a body
+_NUM_CANDIDATES = 600  # centers tried in each convex piece
+_LEAF = 2e-3  # [m] size of the smallest triangle when the cover is proven
+_MAX_BULGE = 0.03  # [m] how far spheres stick out at most
+_RELATIVE_BULGE = 0.1  # of the extent of the body, if that is less
+_ROUNDING = 1e-6  # a length is divided into n parts if it exceeds n parts by less
+
+
+def cover_primitives(
+    model: mujoco.MjModel,
+    geoms: np.ndarray,
+    grain: np.ndarray,
+    *,
+    planar: bool = False,
+) -> tuple[BodySpheres, np.ndarray]:
+    """Spheres that cover geoms of primitive kinds.
+
+    Args:
+        model: a compiled robot.
+        geoms: (g,) indices of the geoms to cover: spheres, capsules and boxes.
+        grain: (g,) half the longest side of a brick, half the longest gap between two spheres [m].
+        planar: heights do not matter, so that boxes are covered as flat rectangles.
+
+    Returns:
+        The spheres, geom by geom, and the geom (n,) that each sphere belongs to.
+
+    Raises:
+        ValueError: a geom of another kind.
+    """
+    used_axes = [1, 1, 0] if planar else [1, 1, 1]
+    centers_of_geoms, radii_of_geoms = [], []
+    for geom, own_grain in zip(geoms, grain, strict=True):
+        centers, radii = cover_geom(
+            mujoco.mjtGeom(model.geom_type[geom]),
+            model.geom_size[geom] * used_axes,
+            float(own_grain),
+        )
+        # The centers are in the geom's frame: bring them to the frame of its body.
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+        centers_of_geoms.append(centers @ rotation.reshape(3, 3).T + model.geom_pos[geom])
+        radii_of_geoms.append(radii)
+    owner = np.repeat(geoms, [len(radii) for radii in radii_of_geoms])
+    spheres = BodySpheres(
+        body=model.geom_bodyid[owner],
+        center=np.concatenate(centers_of_geoms),
+        radius=np.concatenate(radii_of_geoms),
+    )
+    return spheres, owner
+
+
+def cover_geom(
+    kind: mujoco.mjtGeom, size: np.ndarray, grain: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Spheres that cover one geom: a box brick by brick, a capsule along its axis.
+
+    Args:
+        kind: sphere, capsule or box.
+        size: (3,) as MuJoCo's [m].
+        grain: half the longest side of a brick, half the longest gap between two spheres [m].
+
+    Returns:
+        Centers (n, 3) in the geom's frame and radii (n,) [m].
+
+    Raises:
+        ValueError: another kind.
+    """
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return np.zeros((1, 3)), size[:1]
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        radius, half = size[:2]
+        num_gaps = int(np.ceil(half / grain - _ROUNDING))
+        centers = np.zeros((num_gaps + 1, 3))
+        centers[:, 2] = np.linspace(-half, half, num_gaps + 1)
+        # Midway between two centers the spheres must still reach the capsule's surface.
+        return centers, np.full(num_gaps + 1, np.hypot(radius, half / num_gaps))
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        counts = np.maximum(np.ceil(size / grain - _ROUNDING), 1).astype(int)
+        ticks = [h * (2 * np.arange(n) + 1 - n) / n for h, n in zip(size, counts, strict=True)]
+        centers = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+        # A sphere around a brick has half the brick's diagonal as its radius.
+        return centers, np.full(len(centers), np.linalg.norm(size / counts))
+    raise ValueError(f"geom of kind {kind.name}: expected spheres, capsules and boxes")
+
+
+def cover_convex_parts(model: mujoco.MjModel) -> BodySpheres:
+    """Spheres that cover all collision geoms of a model, whatever their shapes.
+
+    Args:
+        model: a compiled robot.
+
+    Returns:
+        The spheres, body by body; the same for the same model.
+
+    Raises:
+        ValueError: a geom has a shape that has no convex hull here.
+    """
+    rng = np.random.default_rng(0)
+    pieces_of_bodies = collision_pieces(model)
+    extents = {
+        body: np.ptp(np.vstack([piece.vertices for piece in pieces]), axis=0).max()
+        for body, pieces in pieces_of_bodies.items()
+    }
+    owners, centers, radii = [], [], []
+    for body, pieces in pieces_of_bodies.items():
+        # Small bodies get a fine cover, but the smallest must not use up most of the spheres.
+        bulge = max(extents[body], max(extents.values()) / 2) * _RELATIVE_BULGE
+        own_centers, own_radii = cover_body(pieces, min(bulge, _MAX_BULGE), rng)
+        owners.append(np.full(len(own_radii), body))
+        centers.append(own_centers)
+        radii.append(own_radii)
+    return BodySpheres(body=np.hstack(owners), center=np.vstack(centers), radius=np.hstack(radii))
+
+
+def cover_body(
+    pieces: list[Piece], bulge: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Greedy medial spheres that contain the surface of a body.
+
+    Args:
+        pieces: convex pieces of the body.
+        bulge: how far a chosen sphere sticks out of the piece that it lies in [m]. Some spheres
+            grow beyond it at last, to close gaps between the samples of the surface.
+        rng: source of randomness.
+
+    Returns:
+        Centers (n, 3) and radii (n,) [m].
+    """
+    surface = surface_samples(pieces, _SURFACE_SPACING, rng)
+    if len(surface) > _MAX_SURFACE_POINTS:
+        surface = surface[rng.choice(len(surface), _MAX_SURFACE_POINTS, replace=False)]
+    # Candidates: inner points, each with the largest sphere that sticks out by the bulge.
+    centers = np.vstack([_inner_points(piece, rng) for piece in pieces])
+    radii = union_depth(pieces, centers) + bulge
+    is_covered_by = np.linalg.norm(surface[:, None] - centers, axis=-1) <= radii
+    # Greedy set cover: take the candidate that covers most of what is bare, until all is covered.
+    chosen = []
+    while len(is_covered_by):
+        best = int(np.argmax(is_covered_by.sum(0)))
+        if not is_covered_by[:, best].any():
+            break
+        chosen.append(best)
+        is_covered_by = is_covered_by[~is_covered_by[:, best]]
+    # Samples prove nothing between them: grow the spheres until they provably contain the surface.
+    return contain_surface(pieces, centers[chosen], radii[chosen], leaf=_LEAF)
+
+
+def _inner_points(piece: Piece, rng: np.random.Generator) -> np.ndarray:
+    """Points (n, 3) where spheres may be centered, most of them far from the surface."""
+    corners = piece.vertices[np.unique(piece.triangles)]
+    points = rng.dirichlet(np.full(len(corners), 0.3), _NUM_CANDIDATES) @ corners
+    spread = np.ptp(corners, axis=0).max() / 10
+    # A random walk uphill in depth, towards the medial axis. Some points stop early, so that
+    # candidates are found between the surface and the axis too.
+    for _ in range(30):
+        moved = points + rng.normal(size=points.shape) * spread
+        better = piece.depth(moved) > piece.depth(points)
+        better &= rng.random(len(points)) > 0.1
+        points = np.where(better[:, None], moved, points)
+        spread *= 0.9
+    return points

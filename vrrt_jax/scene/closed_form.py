@@ -1,0 +1,83 @@
+"""The fast engine: distances of spheres to obstacles in closed form.
+
+Distances are exact and smooth, whereas MJX's collision functions give only a sign for boxes and
+cost many times as much; :mod:`vrrt_jax.scene.mjx` checks one against the other.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax.core.types import pytree
+from vrrt_jax.robots.kinematics import Spheres, link_poses, place, placement
+from vrrt_jax.scene.obstacles import signed_distances
+from vrrt_jax.scene.world import World
+
+
+@pytree
+class ClosedFormWorld(World):
+    """A world whose robot is two sets of spheres.
+
+    Letters: ``n`` collision spheres, ``m`` self-collision spheres.
+    """
+
+    collision_spheres: jax.Array  # (L * 12, 3 n) their placement, see ``kinematics.placement``
+    collision_radius: jax.Array  # (n,) [m]
+    self_collision_spheres: jax.Array  # (L * 12, 3 m) placement of these
+    contact_distance: jax.Array  # (m, m) at which two of them touch, 0 for unchecked pairs [m]
+
+    def is_free(self, q: jax.Array) -> jax.Array:
+        """See :func:`vrrt_jax.scene.world.is_free`."""
+        poses = link_poses(self.chain, q)
+        return (self._clearance(poses) > self.margin) & (self._self_gap(poses) >= 0)
+
+    def obstacle_clearance(self, q: jax.Array) -> jax.Array:
+        """See :func:`vrrt_jax.scene.world.obstacle_clearance`."""
+        return self._clearance(link_poses(self.chain, q))
+
+    def with_margin(self, margin: float) -> Self:
+        """See :func:`vrrt_jax.scene.world.with_margin`."""
+        # A contact distance of zero marks a pair that is not checked, and must stay zero.
+        wider = jnp.where(self.contact_distance > 0, self.contact_distance + margin, 0.0)
+        return dataclasses.replace(self, margin=self.margin + margin, contact_distance=wider)
+
+    def _clearance(self, poses: jax.Array) -> jax.Array:
+        """Smallest distance () between collision spheres and obstacles [m]."""
+        distances = signed_distances(self.obstacles, place(self.collision_spheres, poses))
+        return jnp.min(distances - self.collision_radius[:, None])
+
+    def _self_gap(self, poses: jax.Array) -> jax.Array:
+        """Smallest difference () of squared distance and squared contact distance [m^2]."""
+        centers = place(self.self_collision_spheres, poses)
+        apart = sum((axis[:, None] - axis[None]) ** 2 for axis in centers)
+        # A robot of few links may have no pair to check: then nothing can touch.
+        return jnp.min(apart - self.contact_distance**2, initial=jnp.inf)
+
+
+def closed_form_world(robot: Any, fields: Mapping[str, Any]) -> ClosedFormWorld:
+    """Give a world its robot's spheres.
+
+    Args:
+        robot: from :func:`vrrt_jax.load_robot`.
+        fields: of :class:`vrrt_jax.scene.world.World`.
+    """
+    radius = np.asarray(robot.self_collision_spheres.radius)
+    first, second = np.asarray(robot.self_collision_pairs, int).reshape(-1, 2).T
+    contact_distance = np.zeros((len(radius), len(radius)), np.float32)
+    contact_distance[first, second] = radius[first] + radius[second]
+
+    def placed(spheres: Spheres) -> jax.Array:
+        link, center = np.asarray(spheres.link), np.asarray(spheres.center)
+        return jnp.asarray(placement(link, center, robot.chain.num_links))
+
+    return ClosedFormWorld(
+        collision_spheres=placed(robot.collision_spheres),
+        collision_radius=robot.collision_spheres.radius,
+        self_collision_spheres=placed(robot.self_collision_spheres),
+        contact_distance=jnp.asarray(contact_distance),
+        **fields,
+    )
