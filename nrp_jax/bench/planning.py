@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from nrp_jax.homes.houses import CELLS
-from nrp_jax.learning.data import Settings, home_seed
 from nrp_jax.learning.difficulty import EXPANSIONS, MIN_GEODESIC, fair_house, long_queries
+from nrp_jax.learning.shards import DatasetSettings, home_seed
 from nrp_jax.planner import KINDS, METHODS, PlanResult, Status, plan
 from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.robots import MobileRobot, load_robot
@@ -37,7 +37,7 @@ def unseen_homes(robot: MobileRobot, homes: int, queries: int, seed: int) -> lis
     """The test homes of a data set with this seed, with long queries of a home each."""
     found = []
     for index in range(homes):
-        own = home_seed(Settings(task=robot.name, seed=seed), "test", index)
+        own = home_seed(DatasetSettings(task=robot.name, seed=seed), "test", index)
         house = fair_house(robot, own)
         grid = house.plan() if robot.planar else house.grid
         world = build_world(robot, grid)

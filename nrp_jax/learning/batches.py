@@ -15,7 +15,7 @@ from nrp_jax.homes.grid import RESOLUTION, Grid
 from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning import features, local_map
 from nrp_jax.learning.data import Dataset
-from nrp_jax.learning.expert import POSITIVE
+from nrp_jax.learning.expert import GOOD_RATIO
 from nrp_jax.learning.models import ModelConfig
 from nrp_jax.scene.field import DistanceField, make_field
 from nrp_jax.scene.robots import MobileRobot, batch_link_features
@@ -59,7 +59,7 @@ def surrounding_map(config: ModelConfig, field: DistanceField) -> jax.Array:
     return jnp.where(distances > 0, 0.0, 1.0) if config.paper else distances
 
 
-def view(
+def local_image(
     config: ModelConfig, padded: jax.Array, q: jax.Array, resolution: jax.Array, origin: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """What a model sees from a start ``q`` (D,): an image, and the place of its middle.
@@ -115,13 +115,13 @@ def load_examples(
             "give another data set, or the other --task"
         )
     rows = dataset.rows
-    good = rows["ratio"] <= POSITIVE
+    good = rows["ratio"] <= GOOD_RATIO
     if config.kind == "cvae":
         rows = {name: column[good] for name, column in rows.items()}
         target = weight = np.ones(good.sum())
     else:
         detour = np.maximum(rows["ratio"] - 1.0, 0.0)
-        target = np.exp(-detour / (POSITIVE - 1.0)) if soft else good.astype(np.float32)
+        target = np.exp(-detour / (GOOD_RATIO - 1.0)) if soft else good.astype(np.float32)
         weight = np.ones(len(good))
     grids = [grid.flatten() if robot.planar else grid for grid in dataset.grids]
     return make_examples(config, robot, grids, rows, target=target, weight=weight)
@@ -226,7 +226,7 @@ def _local(config: ModelConfig, examples: Examples, index: jax.Array):
         image = local_map.stacked_window(examples.maps, home, q[0])
         center = local_map.center(q[0])
     else:
-        image, center = view(
+        image, center = local_image(
             config, examples.maps[home], q[0], jnp.float32(RESOLUTION), jnp.zeros(2)
         )
     points = points - jnp.append(center, 0.0)
@@ -248,10 +248,10 @@ def relations(robot: MobileRobot, image: jax.Array, q: jax.Array, points: jax.Ar
     """
     standing = jax.vmap(functools.partial(features.standing_points, robot))(q, points)
     passed = jax.vmap(features.passed_points, (None, 0))(standing[0], standing[2:])
-    parts = [read(image, passed), *(features.steps(robot, q[2:], end) for end in q[:2])]
+    parts = [read_image(image, passed), *(features.steps(robot, q[2:], end) for end in q[:2])]
     return jnp.concatenate(parts, axis=-1)
 
 
-def read(image: jax.Array, points: jax.Array) -> jax.Array:
+def read_image(image: jax.Array, points: jax.Array) -> jax.Array:
     """What an image (X, Y, Z) holds at local points (..., 3) [m], (...)."""
     return image.reshape(-1)[features.cells(points, image.shape, RESOLUTION)]

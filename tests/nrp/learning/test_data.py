@@ -17,9 +17,9 @@ import pytest
 
 from nrp_jax.cli import main
 from nrp_jax.homes import houses
-from nrp_jax.learning import data, local_map
+from nrp_jax.learning import data, local_map, shards
 
-SETTINGS = data.Settings(task="snake", queries=6, waypoints=4, nodes=500, seed=3)
+SETTINGS = shards.DatasetSettings(task="snake", queries=6, waypoints=4, nodes=500, seed=3)
 HOMES = {"homes": 2, "test_homes": 1}
 
 
@@ -42,7 +42,7 @@ def test_rows_and_homes(folder):
         assert train.rows[key].shape == (48, 8) and train.rows[key].dtype == np.float32
     assert np.bincount(train.rows["home"]).tolist() == [24, 24]
     assert (np.bincount(train.rows["query"]) == 8).all()
-    first = houses.generate_house(data.home_seed(SETTINGS, "train", 0)).grid
+    first = houses.generate_house(shards.home_seed(SETTINGS, "train", 0)).grid
     assert (train.grids[0].occupied == first.occupied).all()
     for grid in train.grids:
         assert (grid.occupied != test.grids[0].occupied).any()
@@ -50,9 +50,9 @@ def test_rows_and_homes(folder):
 
 
 def test_splits_never_share_a_home():
-    train = {data.home_seed(dataclasses.replace(SETTINGS, seed=s), "train", k)
+    train = {shards.home_seed(dataclasses.replace(SETTINGS, seed=s), "train", k)
              for s in (0, 1, 99) for k in (0, 1, 9_999)}  # fmt: skip
-    test = {data.home_seed(dataclasses.replace(SETTINGS, seed=s), "test", k)
+    test = {shards.home_seed(dataclasses.replace(SETTINGS, seed=s), "test", k)
             for s in (0, 1, 99) for k in (0, 1, 9_999)}  # fmt: skip
     assert len(train) == len(test) == 9 and max(train) < min(test)
 
@@ -114,7 +114,7 @@ def rows_of(content: bytes, folder: Path) -> dict[str, bytes]:
         ({"task": "fetch"}, "was made with task snake, not fetch"),
         ({"waypoints": 5}, "was made with waypoints 4, not 5"),
         ({"homes_version": 99}, "was made with homes_version 1, not 99"),
-        ({"rows_version": 99}, f"was made with rows_version {data.VERSION}, not 99"),
+        ({"rows_version": 99}, f"was made with rows_version {shards.VERSION}, not 99"),
     ],
 )
 def test_a_data_set_of_other_settings_is_refused(folder, changes, words):
@@ -127,7 +127,7 @@ def test_bad_input(tmp_path, folder):
     with pytest.raises(ValueError, match="is not empty and holds no data set"):
         data.write_dataset(tmp_path, SETTINGS)
     with pytest.raises(ValueError, match="unknown task 'arm'; have: snake, fetch"):
-        data.write_dataset(tmp_path / "a", data.Settings(task="arm"))
+        data.write_dataset(tmp_path / "a", shards.DatasetSettings(task="arm"))
     with pytest.raises(ValueError, match="0 queries: expected at least 1"):
         data.write_dataset(tmp_path / "a", dataclasses.replace(SETTINGS, queries=0))
     with pytest.raises(ValueError, match="unknown split 'validation'"):
@@ -144,8 +144,8 @@ def test_bad_input(tmp_path, folder):
 def test_a_killed_run_leaves_what_the_next_one_finishes(tmp_path):
     out = tmp_path / "set"
     script = (
-        "from nrp_jax.learning import data\n"
-        f"data.write_dataset({str(out)!r}, data.{SETTINGS}, homes=3, test_homes=0)\n"
+        "from nrp_jax.learning import data, shards\n"
+        f"data.write_dataset({str(out)!r}, shards.{SETTINGS}, homes=3, test_homes=0)\n"
     )
     cache = {
         "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,

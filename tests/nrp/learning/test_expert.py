@@ -10,6 +10,9 @@ from nrp_jax import batch_is_free, build_world, load_robot
 from nrp_jax.homes.grid import Grid
 from nrp_jax.homes.houses import generate_house
 from nrp_jax.learning import expert
+from nrp_jax.learning import roadmap as roadmaps
+from nrp_jax.learning.edge_check import check_edges
+from nrp_jax.learning.roadmap import build_roadmap
 from nrp_jax.scene.robots import batch_link_features
 
 NODES, QUERIES, WAYPOINTS = 900, 20, 8
@@ -28,7 +31,7 @@ def world(robot):
 
 @pytest.fixture(scope="module")
 def roadmap(robot, world):
-    return expert.build_roadmap(world, robot, jax.random.key(0), NODES)
+    return build_roadmap(world, robot, jax.random.key(0), NODES)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +70,7 @@ def test_edges_as_a_plain_loop_finds_them(world, roadmap, rng):
     pairs = rng.integers(0, len(roadmap.q), (4000, 2))
     near = np.abs(np.diff(roadmap.q[pairs][..., :2], axis=1)).max((1, 2)) < 1.0
     pairs = pairs[near][:60].astype(np.int32)
-    length, free = expert.check_edges(world, roadmap.q, pairs)
+    length, free = check_edges(world, roadmap.q, pairs)
     assert 0 < free.sum() < len(pairs) == 60
     for (a, b), found, far in zip(roadmap.q[pairs], free, length, strict=True):
         step = between(world, a, b, [1.0])[0] - a
@@ -107,13 +110,13 @@ def test_roadmap(robot, world, roadmap):
 
 
 def test_candidates_are_the_pairs_with_the_least_change_of_posture(robot, world, roadmap):
-    everything = expert._neighbours(world, robot, roadmap.q)
-    few = expert.CANDIDATES
+    everything = roadmaps._neighbors(world, robot, roadmap.q)
+    few = roadmaps.CANDIDATES
     try:
-        expert.CANDIDATES = 10
-        chosen = expert._neighbours(world, robot, roadmap.q)
+        roadmaps.CANDIDATES = 10
+        chosen = roadmaps._neighbors(world, robot, roadmap.q)
     finally:
-        expert.CANDIDATES = few
+        roadmaps.CANDIDATES = few
     assert len(chosen) == 5 * len(roadmap.q) < len(everything)
 
     def change(pairs):
@@ -152,8 +155,8 @@ def test_rows_say_what_the_shortest_paths_are(world, roadmap, rows):
 
 def test_rows_are_of_all_sorts(rows):
     ratio = rows.ratio
-    assert (ratio <= expert.POSITIVE).mean() > 0.2
-    assert ((ratio > expert.POSITIVE) & np.isfinite(ratio)).mean() > 0.15
+    assert (ratio <= expert.GOOD_RATIO).mean() > 0.2
+    assert ((ratio > expert.GOOD_RATIO) & np.isfinite(ratio)).mean() > 0.15
     assert np.isinf(ratio).mean() > 0.15
     apart = np.linalg.norm(rows.q_goal[:, :2] - rows.q_start[:, :2], axis=1)
     assert apart.min() < 2 < apart.max()
@@ -165,7 +168,7 @@ def test_a_wall_with_a_door_is_passed_through_the_door(robot):
     occupied[[0, -1]] = occupied[:, [0, -1]] = True
     occupied[19:21, :28] = True
     world = build_world(robot, Grid(occupied=occupied))
-    roadmap = expert.build_roadmap(world, robot, jax.random.key(1), 600)
+    roadmap = build_roadmap(world, robot, jax.random.key(1), 600)
     cost = path_lengths(
         roadmap, int(np.argmin(np.linalg.norm(roadmap.q[:, :2] - [3.2, 0.8], axis=1)))
     )
@@ -184,4 +187,4 @@ def test_betweenness_of_a_chain_with_a_twig():
 def test_a_home_that_is_full(robot):
     world = build_world(robot, Grid(occupied=np.ones((30, 30, 1), bool)))
     with pytest.raises(ValueError, match="only 0 of .* are free"):
-        expert.build_roadmap(world, robot, jax.random.key(0), 500)
+        build_roadmap(world, robot, jax.random.key(0), 500)

@@ -10,7 +10,7 @@ from nrp_synthetic import random_grid
 
 from nrp_jax.homes.grid import RESOLUTION
 from nrp_jax.learning import features, local_map, models
-from nrp_jax.learning.batches import relations, surrounding_map, view
+from nrp_jax.learning.batches import local_image, relations, surrounding_map
 from nrp_jax.learning.checkpoint import Model, build_module, check_model, load_model, save_model
 from nrp_jax.learning.models import ModelConfig
 from nrp_jax.scene.robots import link_features, load_robot
@@ -123,7 +123,7 @@ def test_images_show_what_surrounds_the_start():
     config = ModelConfig.default("snake", "discriminator")
     padded = surrounding_map(config, world.field)
     q = jnp.zeros(8).at[:2].set(jnp.array([1.23, 4.77]))
-    image, center = view(config, padded, q, jnp.float32(RESOLUTION), jnp.zeros(2))
+    image, center = local_image(config, padded, q, jnp.float32(RESOLUTION), jnp.zeros(2))
     image = np.asarray(image)
     np.testing.assert_allclose(center, [1.2, 4.8], atol=1e-6)
     for cell in np.ndindex(40, 40):
@@ -131,7 +131,7 @@ def test_images_show_what_surrounds_the_start():
         inside = (place >= 0).all() and (place < 60).all()
         solid = not inside or grid.occupied[place[0], place[1], 0]
         assert (image[*cell, 0] == 0.0) == solid
-    whole, middle = view(
+    whole, middle = local_image(
         ModelConfig.default("snake", "cvae", "map"), padded, q, jnp.float32(0.1), jnp.zeros(2)
     )
     assert whole.shape == (100, 100, 1) and float(whole[:20].max()) == 0.0

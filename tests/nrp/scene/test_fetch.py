@@ -10,6 +10,8 @@ from nrp_synthetic import free, random_grid
 
 from nrp_jax import batch_is_free, build_world, load_robot, load_sampler, samplers
 from nrp_jax.learning import expert
+from nrp_jax.learning.edge_check import check_edges
+from nrp_jax.learning.roadmap import build_roadmap
 
 NODES = 600
 
@@ -26,14 +28,14 @@ def world(robot):
 
 @pytest.fixture(scope="module")
 def roadmap(robot, world):
-    return expert.build_roadmap(world, robot, jax.random.key(0), NODES)
+    return build_roadmap(world, robot, jax.random.key(0), NODES)
 
 
 def test_edges_as_a_plain_loop_finds_them(world, roadmap, rng):
     pairs = rng.integers(0, len(roadmap.q), (3000, 2))
     near = np.abs(np.diff(roadmap.q[pairs][..., :2], axis=1)).max((1, 2)) < 1.0
     pairs = pairs[near][:60].astype(np.int32)
-    length, found = expert.check_edges(world, roadmap.q, pairs)
+    length, found = check_edges(world, roadmap.q, pairs)
     start, end = (jnp.asarray(roadmap.q[pairs[:, k]]) for k in (0, 1))
     edge = world.edge(start, end)
     np.testing.assert_allclose(length, world.length(edge), rtol=1e-4)
@@ -68,7 +70,7 @@ def test_rows(robot, world, roadmap):
 @pytest.mark.parametrize("kind", ["discriminator", "cvae"])
 def test_packaged_samplers_know_the_way(kind, world, roadmap, rng):
     """Their first choice, without a look at its edge; and that of the same weights in disorder."""
-    trained = load_sampler("fetch", kind, checked=1)
+    trained = load_sampler("fetch", kind, num_edge_checked=1)
     disorder = jax.tree.map(
         lambda leaf: jnp.asarray(rng.permutation(np.ravel(leaf)).reshape(leaf.shape)),
         trained.variables,
