@@ -9,7 +9,8 @@ import pytest
 from nrp_synthetic import free, random_grid
 
 from nrp_jax import samplers
-from nrp_jax.bench import optimality, score
+from nrp_jax.bench import score
+from nrp_jax.bench.optimality import make_queries, optimality
 from nrp_jax.homes.grid import Grid
 from nrp_jax.learning.batches import make_batch, make_examples
 from nrp_jax.learning.checkpoint import Model, build_module, save_model
@@ -135,7 +136,7 @@ def test_scores_of_waypoints(world):
     """The expert's own waypoint scores 1, one behind a wall 0, one off the way in between."""
     robot = load_robot("snake")
     roadmap = build_roadmap(world, robot, jax.random.key(0), 500)
-    queries = optimality.make_queries(world, robot, roadmap, 20, seed=0)
+    queries = make_queries(world, robot, roadmap, 20, seed=0)
     best = np.array(
         [
             np.argmin(np.where(row > 0, row + queries.cost[goal], np.inf))
@@ -144,14 +145,12 @@ def test_scores_of_waypoints(world):
             )
         ]
     )
-    expert = optimality.optimality(world, robot, roadmap, queries, roadmap.q[best])
+    expert = optimality(world, robot, roadmap, queries, roadmap.q[best])
     np.testing.assert_allclose(expert, 1.0, atol=1e-3)
     blocked = roadmap.q[best].copy()
     blocked[:, :2] = -1.0
-    np.testing.assert_array_equal(
-        optimality.optimality(world, robot, roadmap, queries, blocked), 0.0
-    )
+    np.testing.assert_array_equal(optimality(world, robot, roadmap, queries, blocked), 0.0)
     rng = np.random.default_rng(0)
     aside = roadmap.q[queries.start] + rng.uniform(-0.3, 0.3, (20, 8)).astype(np.float32)
-    scores = optimality.optimality(world, robot, roadmap, queries, aside)
+    scores = optimality(world, robot, roadmap, queries, aside)
     assert (scores <= 1).all() and 0 < np.median(scores) < 1
