@@ -17,9 +17,9 @@ import numpy as np
 
 from nrp_jax.scene.world import GridWorld
 
-EDGE_BATCH = 1 << 16  # edges prepared by one compiled call, at most
-POINT_BATCH = 1 << 12  # configurations checked by one compiled call, at most
-_SMALL = 1 << 9  # batches have this many rows where these are enough
+EDGE_BATCH = 1 << 16  # edges prepared by one compiled call; other sizes round lengths differently
+POINT_BATCH = 1 << 12  # configurations checked by one compiled call ...
+SMALL_POINT_BATCH = 1 << 9  # ... where these do not suffice
 _MAX_DEPTH = 7  # an edge has 2**7 parts at most
 
 
@@ -49,7 +49,7 @@ def check_edges(
     nodes = jnp.asarray(q)
     for first in range(0, len(pairs), EDGE_BATCH):
         block = pairs[first : first + EDGE_BATCH]
-        batch = pad_rows(block, _batch_size(len(block), EDGE_BATCH))
+        batch = pad_rows(block, EDGE_BATCH)
         q_from, edge, length, parts = _prepare(world, nodes, batch[:, 0], batch[:, 1])
         parts = np.asarray(parts)[: len(block)]
         if parts.max() > 2**_MAX_DEPTH:
@@ -77,11 +77,6 @@ def pad_rows(rows: np.ndarray, size: int) -> np.ndarray:
     padded = np.zeros((size, *rows.shape[1:]), rows.dtype)
     padded[: len(rows)] = rows
     return padded
-
-
-def _batch_size(num: int, largest: int) -> int:
-    """Rows of a batch for ``num`` rows: one of two sizes, so that little is compiled."""
-    return _SMALL if num <= _SMALL else largest
 
 
 def _halvings():
@@ -130,7 +125,7 @@ def _survivors(
     new = (at != before) & (at != after)
     asked, fraction = alive[new], (at[new] / num[new]).astype(np.float32)
     results = [np.zeros(0, bool)]
-    size = _batch_size(len(asked), POINT_BATCH)
+    size = SMALL_POINT_BATCH if len(asked) <= SMALL_POINT_BATCH else POINT_BATCH
     for first in range(0, len(asked), size):
         index = pad_rows(asked[first : first + size], size)
         where = pad_rows(fraction[first : first + size], size)
