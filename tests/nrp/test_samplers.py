@@ -15,8 +15,8 @@ from nrp_jax.homes.grid import Grid
 from nrp_jax.learning.batches import make_batch, make_examples
 from nrp_jax.learning.checkpoint import Model, build_module, save_model
 from nrp_jax.learning.models import ModelConfig
+from nrp_jax.learning.objective import init
 from nrp_jax.learning.roadmap import build_roadmap
-from nrp_jax.learning.train import init
 from nrp_jax.scene.robots import load_robot
 from nrp_jax.scene.world import build_world, with_grid
 

@@ -72,7 +72,7 @@ def test_scores_are_written(folder, tmp_path, capsys):
     own = shutil.copytree(folder, tmp_path / "set")  # roadmaps will be kept in it
     out = tmp_path / "score.json"
     command = ["score", "--data", str(own), "--maps", str(maps), "--queries", "8"]
-    command += ["--nodes", "1500", "--json", str(out)]
+    command += ["--nodes", "500", "--json", str(out)]
     assert main([*command, "--task", "snake"]) == 0
     found = json.loads(out.read_text())
     assert found["checked"] and found["maps"]["names"] == ["home.npz"]

@@ -164,7 +164,7 @@ def test_candidates_are_judged_one_by_one():
     keys = jax.random.split(jax.random.key(1), len(inputs))
     inputs = [jax.random.normal(k, x.shape) for k, x in zip(keys, inputs, strict=True)]
     module = build_module(config, 0)
-    variables = module.init(jax.random.key(0), *inputs)
+    variables = jax.jit(module.init)(jax.random.key(0), *inputs)
     together = module.apply(variables, *inputs)
     assert together.shape == (2, 5) and float(jnp.std(together)) > 0
     alone = module.apply(variables, *inputs[:3], *(x[:, 2:3] for x in inputs[3:]))
