@@ -1,4 +1,4 @@
-"""Data sets: complete after any interruption, and refused rather than mixed; local windows."""
+"""Data sets: complete after any interruption, and refused rather than mixed."""
 
 import dataclasses
 import json
@@ -11,13 +11,12 @@ import time
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from nrp_jax.cli import main
 from nrp_jax.homes import houses
-from nrp_jax.learning import data, local_map, shards
+from nrp_jax.learning import data, shards
 
 SETTINGS = shards.DatasetSettings(task="snake", queries=6, waypoints=4, nodes=500, seed=3)
 HOMES = {"homes": 2, "test_homes": 1}
@@ -71,8 +70,9 @@ def test_scores_are_written(folder, tmp_path, capsys):
     data.load_dataset(folder, "test").grids[0].save(maps / "home.npz")
     own = shutil.copytree(folder, tmp_path / "set")  # roadmaps will be kept in it
     out = tmp_path / "score.json"
-    command = ["score", "--data", str(own), "--maps", str(maps), "--queries", "8"]
-    command += ["--nodes", "500", "--json", str(out)]
+    unmapped = ["score", "--data", str(own), "--queries", "8", "--nodes", "500"]
+    unmapped += ["--json", str(out)]
+    command = [*unmapped, "--maps", str(maps)]
     assert main([*command, "--task", "snake"]) == 0
     found = json.loads(out.read_text())
     assert found["checked"] and found["maps"]["names"] == ["home.npz"]
@@ -80,7 +80,7 @@ def test_scores_are_written(folder, tmp_path, capsys):
         for kind in ("discriminator", "cvae"):
             assert 0.5 < homes[kind]["optimality_score"] <= 1.0 and homes[kind]["queries"] == 8
             assert homes[kind]["ms_per_32"] > 0
-    assert main([*command, "--task", "snake", "--unchecked"]) == 0
+    assert main([*unmapped, "--task", "snake", "--unchecked"]) == 0
     rough = json.loads(out.read_text())["unseen_homes"]["cvae"]["optimality_score"]
     assert rough < found["unseen_homes"]["cvae"]["optimality_score"]
     assert main([*command, "--task", "fetch"]) == 2
@@ -181,38 +181,3 @@ def test_what_other_processes_did_survives_a_failure(whole, tmp_path):
     done = json.loads((out / data.MANIFEST).read_text())["shards"]
     assert list(done) == ["train_00000.npz"]
     assert (out / "train_00000.npz").read_bytes() == whole["train_00000.npz"]
-
-
-def with_border(occupied):
-    return jnp.asarray(np.pad(occupied, [(20, 20), (20, 20), (0, 0)], constant_values=True))
-
-
-def test_windows(rng):
-    occupied = rng.random((70, 60, 3)) < 0.3
-    padded = with_border(occupied)
-    q = rng.uniform([0, 0], [7, 6], (200, 2)).astype(np.float32)
-    q[:3] = [[0, 0], [7, 6], [0.04, 5.96]]
-    windows = np.asarray(jax.vmap(local_map.window, (None, 0))(padded, jnp.asarray(q)))
-    centers = np.asarray(local_map.center(jnp.asarray(q)))
-    assert windows.shape == (200, 40, 40, 3)
-    assert np.abs(centers - q).max() <= 0.0501
-    for window, center in zip(windows, centers, strict=True):
-        corner = np.round(center * 10).astype(int) - 20
-        expected = np.ones((40, 40, 3), bool)
-        for i, j in np.ndindex(40, 40):
-            x, y = corner[0] + i, corner[1] + j
-            if 0 <= x < 70 and 0 <= y < 60:
-                expected[i, j] = occupied[x, y]
-        assert (window == expected).all()
-
-
-def test_windows_of_a_map_with_an_origin_and_of_stacked_maps(rng):
-    maps = rng.random((2, 50, 50, 1)) < 0.3
-    q = jnp.array([1.23, 3.21])
-    shifted = local_map.window(with_border(maps[1]), q - jnp.array([2.0, 1.0]), 0.1, (-2.0, -1.0))
-    plain = local_map.window(with_border(maps[1]), q)
-    stacked = jnp.stack([with_border(m) for m in maps])
-    assert (shifted == plain).all()
-    assert (local_map.stacked_window(stacked, jnp.int32(1), q) == plain).all()
-    moved = local_map.center(q - jnp.array([2.0, 1.0]), 0.1, (-2.0, -1.0))
-    assert np.asarray(moved) == pytest.approx([-0.8, 2.2], abs=1e-5)

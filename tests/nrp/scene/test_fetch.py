@@ -31,18 +31,28 @@ def roadmap(robot, world):
     return build_roadmap(world, robot, jax.random.key(0), NODES)
 
 
+# Compiled: operation by operation, curves take seconds.
+interpolate = jax.jit(lambda world, q_a, q_b, fraction: world.interpolate(q_a, q_b, fraction))
+
+
+def measured(world, q_a, q_b):
+    """Lengths (n,) and spans (n,) of edges."""
+    edge = world.edge(q_a, q_b)
+    return world.length(edge), world.span(edge)
+
+
 def test_edges_as_a_plain_loop_finds_them(world, roadmap, rng):
     pairs = rng.integers(0, len(roadmap.q), (3000, 2))
     near = np.abs(np.diff(roadmap.q[pairs][..., :2], axis=1)).max((1, 2)) < 1.0
     pairs = pairs[near][:60].astype(np.int32)
     length, found = check_edges(world, roadmap.q, pairs)
     start, end = (jnp.asarray(roadmap.q[pairs[:, k]]) for k in (0, 1))
-    edge = world.edge(start, end)
-    np.testing.assert_allclose(length, world.length(edge), rtol=1e-4)
-    parts = np.ceil(np.asarray(world.span(edge)) / float(world.resolution) - 1e-4)
+    exact, span = jax.jit(measured)(world, start, end)
+    np.testing.assert_allclose(length, exact, rtol=1e-4)
+    parts = np.ceil(np.asarray(span) / float(world.resolution) - 1e-4)
     for k, num in enumerate(parts.astype(int)):
         fraction = np.minimum(np.arange(1, 128) / max(num, 1), 1.0).astype(np.float32)
-        points = world.interpolate(start[k][None], end[k][None], fraction)
+        points = interpolate(world, start[k][None], end[k][None], fraction)
         assert found[k] == bool(np.asarray(batch_is_free(world, points)).all())
     assert 0 < found.sum() < len(pairs)
 
@@ -51,7 +61,7 @@ def test_an_edge_of_the_roadmap_sweeps_nothing(world, roadmap):
     a, b = roadmap.lengths.nonzero()
     chosen = np.random.default_rng(1).choice(len(a), 60, replace=False)
     q_a, q_b = (jnp.asarray(roadmap.q[ends[chosen]])[:, None] for ends in (a, b))
-    fine = world.interpolate(q_a, q_b, jnp.linspace(0.0, 1.0, 200)[None])
+    fine = interpolate(world, q_a, q_b, jnp.linspace(0.0, 1.0, 200)[None])
     ok = free(world, np.asarray(fine).reshape(-1, 11)).reshape(60, 200)
     # Between checks 0.2 m or rad apart a corner may be grazed: not often, and not for long.
     assert ok.all(1).mean() > 0.7
