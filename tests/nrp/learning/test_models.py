@@ -33,7 +33,7 @@ def shapes(config: ModelConfig, candidates: int = 3, lanes: int = 2):
         own = features.configuration_features(config, robot, q, points)
         goal = features.goal_features(config, robot, q, points)
         standing = features.standing_points(robot, q, points)
-        touched = jnp.zeros(features.WAY * len(standing) + 4)
+        touched = jnp.zeros(features.PATH_SAMPLES * len(standing) + 4)
         each = jnp.zeros((lanes, candidates, 1))
         last = each * touched if config.kind == "discriminator" else jax.random.key(0)
         start = jnp.zeros((lanes, 1)) * own
