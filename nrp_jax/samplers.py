@@ -219,7 +219,12 @@ def _first_free(world: GridWorld, q_from: jax.Array, q: jax.Array, num_checks: i
 
 
 def make_sampler(model: Model, **settings: Any) -> DiscriminatorSampler | CVAESampler:
-    """A sampler of a trained model; settings are fields such as ``candidates``."""
+    """Make a sampler of a trained model.
+
+    Args:
+        model: from :func:`nrp_jax.learning.checkpoint.load_model` or a training.
+        settings: fields of :class:`DiscriminatorSampler` or :class:`CVAESampler`.
+    """
     robot, config = load_robot(model.config.task), model.config
     shared = {"robot": robot, "variables": model.variables, "config": config, **settings}
     if config.kind == "discriminator":
@@ -235,7 +240,8 @@ def load_sampler(
     Args:
         task: "snake" or "fetch".
         kind: "discriminator" or "cvae".
-        path: what ``nrp train`` wrote, a folder or its ``model.npz``; the packaged weights if None.
+        path: a folder that ``nrp train`` wrote, or the ``model.npz`` in it; the packaged weights
+            if None.
         settings: fields of :class:`DiscriminatorSampler` or :class:`CVAESampler`.
 
     Raises:
@@ -249,13 +255,17 @@ def load_sampler(
 
 
 def check_fits(sampler: Any, robot: MobileRobot, world: GridWorld, kind: str) -> None:
-    """Raise a ValueError if a sampler of this module is for something else.
+    """Check that a sampler of this module suits a robot and a map.
 
     Args:
-        sampler: any sampler; those of other makes are trusted.
-        robot: that is planned for.
+        sampler: any sampler; other classes are not checked.
+        robot: to plan for.
         world: the robot in a home.
-        kind: "discriminator" or "cvae".
+        kind: "discriminator" or "cvae", which the planner needs.
+
+    Raises:
+        ValueError: the sampler is of another task or kind, or the map's cells are others than those
+            that the networks were trained on.
     """
     if not isinstance(sampler, DiscriminatorSampler | CVAESampler):
         return
