@@ -140,7 +140,7 @@ class _Draft:
         self.body = body
         i, j = np.ogrid[-SPREAD : SPREAD + 1, -SPREAD : SPREAD + 1]
         self.disc = i**2 + j**2 < (SPREAD + 0.5) ** 2
-        # Cells where the center of the base cannot be; a bit fewer near walls, to let it through doors.
+        # Cells where the center of the base cannot be; a bit fewer near walls, so that doors pass.
         self.blocked = _distance(~self.walls) <= SPREAD - 0.5
 
     def keep_clear(self, door: Room, reach: int = 6) -> None:
