@@ -119,9 +119,10 @@ def test_a_diverged_training_keeps_the_best_epoch(rows, tmp_path, monkeypatch):
 
 
 def test_the_generator_learns(rows, tmp_path):
-    config = ModelConfig.default("snake", "cvae")
+    config = dataclasses.replace(small_config("cvae"), context=96, width=96)
     robot, examples = examples_of(config, rows)
-    model = train(config, robot, examples, tmp_path, settings=SETTINGS, progress=False)
+    settings = dataclasses.replace(SETTINGS, epochs=24, learning_rate=8e-3)
+    model = train(config, robot, examples, tmp_path, settings=settings, progress=False)
     batch = make_batch(config, robot, examples, np.arange(len(examples.home)))
     spread = np.asarray(batch.waypoints)[np.asarray(batch.weight) > 0].var(axis=0).mean()
     assert -model.info["best"]["quality"] < 0.9 * spread
