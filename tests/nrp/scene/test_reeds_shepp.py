@@ -147,5 +147,5 @@ def test_wide_turns_scale_with_the_radius(rng):
 def test_any_leading_axes(rng, shape):
     n = int(np.prod(shape))
     a, b = poses(rng, n).reshape(*shape, 3), poses(rng, n).reshape(*shape, 3)
-    assert length(a, b).shape == shape
-    assert interpolate(a, b, jnp.float32(0.5)).shape == (*shape, 3)
+    assert jax.eval_shape(length, a, b).shape == shape
+    assert jax.eval_shape(interpolate, a, b, jnp.float32(0.5)).shape == (*shape, 3)
