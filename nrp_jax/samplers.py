@@ -16,12 +16,13 @@ from nrp_jax.homes.grid import HEIGHT, RESOLUTION
 from nrp_jax.learning import features
 from nrp_jax.learning.batches import describe, read_image, relations
 from nrp_jax.learning.checkpoint import Model, build_module, check_model, load_model
+from nrp_jax.learning.edge_check import first_free
 from nrp_jax.learning.local_map import SIDE
 from nrp_jax.learning.models import CVAE, ModelConfig, check_choices
 from nrp_jax.learning.network_inputs import NetworkInputs, network_inputs
 from nrp_jax.scene.robots import MobileRobot, batch_link_features, load_robot
 from nrp_jax.scene.world import GridWorld
-from vrrt_jax.core.edges import difference, enforce_bounds, free_prefix
+from vrrt_jax.core.edges import difference, enforce_bounds
 from vrrt_jax.core.types import pytree, static
 
 HALF_WINDOW = SIDE / 2 * RESOLUTION  # from the center of a local window to its sides [m]
@@ -91,7 +92,7 @@ class DiscriminatorSampler:
         _, best = jax.lax.top_k(jnp.where(possible, logits, -jnp.inf), num)
         chosen = jnp.take_along_axis(q, best[..., None], axis=1)
         chosen = enforce_bounds(world, features.to_world(chosen, inputs.center[:, None]))
-        return _first_free(world, q_from, chosen, self.edge_checks)
+        return first_free(world, q_from, chosen, self.edge_checks)
 
     def _candidates(
         self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
@@ -164,7 +165,7 @@ class CVAESampler:
         )
         q = features.to_configuration(self.config, self.robot, made)
         q = enforce_bounds(world, features.to_world(q, inputs.center[:, None]))
-        return _first_free(world, q_from, q, self.edge_checks)
+        return first_free(world, q_from, q, self.edge_checks)
 
 
 def _postures(
@@ -183,39 +184,6 @@ def _postures(
     base = jnp.arange(q.shape[-1]) < robot.base_dim
     q = jnp.where(base, jnp.pi * noise, q + scale * noise)
     return enforce_bounds(world, q.at[..., :2].set(0.0)).at[..., :2].set(0.0)
-
-
-def _first_free(world: GridWorld, q_from: jax.Array, q: jax.Array, num_checks: int) -> jax.Array:
-    """The first waypoint (B, D) of each lane whose edge is free; the best if none is.
-
-    Args:
-        world: the robot in a home.
-        q_from: (B, D) starts of the edges.
-        q: (B, K, D) waypoints, the best first.
-        num_checks: configurations checked along each edge, the last of them the waypoint.
-    """
-    lanes, many, joints = q.shape
-    if many == 1:
-        return q[:, 0]
-    # A round checks B edges, of the lanes that have found no free one. Most lanes are done after
-    # the first round, so that the others get several edges of the next. ``turn`` orders the edges:
-    # the best of all lanes, then the second best, and so on.
-    turn = jnp.arange(many)[None] * lanes + jnp.arange(lanes)[:, None]
-
-    def check_round(state):
-        pending, free = state  # (B, K) edges still to check, and those found free
-        _, index = jax.lax.top_k(-jnp.where(pending, turn, many * lanes).reshape(-1), lanes)
-        lane = index // many
-        edge = world.edge(q_from[lane], q.reshape(-1, joints)[index])
-        whole = free_prefix(world, q_from[lane], edge, num_checks) == num_checks
-        free = free.at[lane, index % many].max(whole)
-        pending = pending.at[lane, index % many].set(False)
-        # A lane with a free edge has no more edges to check.
-        return pending & ~jnp.any(free, axis=1, keepdims=True), free
-
-    untried = jnp.ones((lanes, many), bool)
-    _, free = jax.lax.while_loop(lambda s: jnp.any(s[0]), check_round, (untried, ~untried))
-    return jnp.take_along_axis(q, jnp.argmax(free, axis=1)[:, None, None], axis=1)[:, 0]
 
 
 def make_sampler(model: Model, **settings: Any) -> DiscriminatorSampler | CVAESampler:

@@ -29,6 +29,7 @@ from nrp_jax.scene.world import GridWorld, build_world
 from vrrt_jax.core.timing import machine
 
 LANES = 32  # waypoints proposed at a time, as a planner asks for them
+_REPEATS = 32  # of a timing
 
 
 def propose_all(
@@ -52,7 +53,7 @@ def milliseconds_per_32(sampler: samplers.Sampler, world: GridWorld, q: np.ndarr
     """Median time of 32 proposals between configurations (n, D), without compilation [ms]."""
     q_from, q_goal = (jnp.asarray(np.resize(part, (LANES, q.shape[1]))) for part in (q, q[::-1]))
     times = []
-    for k in range(32):
+    for k in range(_REPEATS):
         started = time.perf_counter()
         jax.block_until_ready(samplers.propose(sampler, world, q_from, q_goal, jax.random.key(k)))
         times.append(time.perf_counter() - started)
@@ -80,11 +81,12 @@ def score_homes(
         queries: of each home.
         nodes: of each roadmap.
         cache: folder where roadmaps are kept between runs.
-        progress: called with a line for each home.
+        progress: called with a line of text for each home.
 
     Returns:
-        For each sampler ``optimality_score`` (mean), ``reachable`` (share of waypoints with a free
-        edge from the start and a way on), ``by_home`` (mean scores) and ``ms_per_32``.
+        For each sampler ``optimality_score`` (mean of all queries), ``reachable`` (share of
+        waypoints with a score above 0), ``by_home`` (mean scores), ``ms_per_32`` (time of 32
+        proposals [ms]) and ``queries`` (their number).
     """
     scores: dict[str, list[np.ndarray]] = {name: [] for name in tested}
     times: dict[str, list[float]] = {name: [] for name in tested}

@@ -1,11 +1,12 @@
-"""Checks of very many edges of a home, on the host.
+"""Edge checks that stop early: of a roadmap's many edges, and of a lane's ranked waypoints.
 
-Planners check edges with :func:`vrrt_jax.core.edges.free_prefix`: a fixed number of sub-steps, from
-the start on, as they want to know how far an edge is free. A roadmap has a million edges of very
-different lengths, only wants to know whether the whole edge is free, and most edges are blocked. So
-each edge gets the fewest sub-steps that its length needs, these are checked from the middle
-outwards, and an edge is dropped as soon as one configuration collides. Letters: ``N`` nodes, ``M``
-edges, ``D`` joints.
+Planners check edges with :func:`vrrt_jax.core.edges.free_prefix`: a fixed number of sub-steps on
+every edge, from its start on, as they want to know how far it is free. :func:`first_free` uses it
+too. :func:`check_edges` cannot. A roadmap has a million edges of very different lengths, only wants
+to know whether a whole edge is free, and most edges are blocked. So each edge gets the fewest
+sub-steps that its length needs, these are checked from the middle outwards, and an edge is dropped
+as soon as one configuration collides. Letters: ``N`` nodes, ``M`` edges, ``B`` lanes, ``K``
+waypoints of a lane, ``D`` joints.
 """
 
 from collections.abc import Callable
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax.scene.world import GridWorld
+from vrrt_jax.core.edges import free_prefix
 
 EDGE_BATCH = 1 << 16  # edges prepared by one compiled call; other sizes round lengths differently
 POINT_BATCH = 1 << 12  # configurations checked by one compiled call ...
@@ -142,3 +144,36 @@ def _points_free(world: GridWorld, q_from, edge, index: jax.Array, fraction: jax
     q = world.end(q_from[index], world.truncate(edge, fraction))
     # Without the barrier the points are computed once for every use of a joint.
     return jax.vmap(world.is_free)(jax.lax.optimization_barrier(q))
+
+
+def first_free(world: GridWorld, q_from: jax.Array, q: jax.Array, num_checks: int) -> jax.Array:
+    """The first waypoint (B, D) of each lane whose edge is free; the best if none is.
+
+    Args:
+        world: the robot in a home.
+        q_from: (B, D) starts of the edges.
+        q: (B, K, D) waypoints, the best first.
+        num_checks: configurations checked along each edge, the last of them the waypoint.
+    """
+    lanes, many, joints = q.shape
+    if many == 1:
+        return q[:, 0]
+    # A round checks B edges, of the lanes that have found no free one. Most lanes are done after
+    # the first round, so that the others get several edges of the next. ``turn`` orders the edges:
+    # the best of all lanes, then the second best, and so on.
+    turn = jnp.arange(many)[None] * lanes + jnp.arange(lanes)[:, None]
+
+    def check_round(state):
+        pending, free = state  # (B, K) edges still to check, and those found free
+        _, index = jax.lax.top_k(-jnp.where(pending, turn, many * lanes).reshape(-1), lanes)
+        lane = index // many
+        edge = world.edge(q_from[lane], q.reshape(-1, joints)[index])
+        whole = free_prefix(world, q_from[lane], edge, num_checks) == num_checks
+        free = free.at[lane, index % many].max(whole)
+        pending = pending.at[lane, index % many].set(False)
+        # A lane with a free edge has no more edges to check.
+        return pending & ~jnp.any(free, axis=1, keepdims=True), free
+
+    untried = jnp.ones((lanes, many), bool)
+    _, free = jax.lax.while_loop(lambda s: jnp.any(s[0]), check_round, (untried, ~untried))
+    return jnp.take_along_axis(q, jnp.argmax(free, axis=1)[:, None, None], axis=1)[:, 0]

@@ -183,8 +183,8 @@ def build_world(
     Args:
         robot: from :func:`nrp_jax.load_robot`.
         grid: from :func:`nrp_jax.load_map` or a generator; the snake sees its planar map.
-        wrap: joints without limits turn the short way round; otherwise they are intervals, as in
-            the paper. A heading always wraps.
+        wrap: joints without limits turn the shorter way round; otherwise they are intervals, as
+            in the paper. A heading always wraps.
         resolution: longest sub-step of any joint between two collision checks [m] or [rad]; the
             paper's by default.
         arm_weight: meters that a radian of the arm counts for in the metric; the paper's by
