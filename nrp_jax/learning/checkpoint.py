@@ -26,11 +26,6 @@ class Model:
     variables: Any  # flax variables: params, and batch_stats of the published models
     info: dict[str, Any]  # "num_outputs", and how the model was trained, with its best epoch
 
-    @property
-    def module(self) -> Discriminator | CVAE:
-        """The flax module that the variables belong to."""
-        return build_module(self.config, self.info["num_outputs"])
-
 
 def build_module(config: ModelConfig, num_outputs: int) -> Discriminator | CVAE:
     """Build the flax module of a configuration.

@@ -9,7 +9,6 @@ as soon as one configuration collides. Letters: ``N`` nodes, ``M`` edges, ``B`` 
 waypoints of a lane, ``D`` joints.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -19,17 +18,16 @@ import numpy as np
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.edges import free_prefix
 
-EDGE_BATCH = 1 << 16  # edges prepared by one compiled call; other sizes round lengths differently
-POINT_BATCH = 1 << 12  # configurations checked by one compiled call ...
-SMALL_POINT_BATCH = 1 << 9  # ... where these do not suffice
+# Edges prepared by one compiled call. Data sets depend on it: with batches of another size, lengths
+# differ in their last bits.
+EDGE_BATCH = 1 << 16
+POINT_BATCH = 1 << 12  # configurations checked by one compiled call
+SMALL_POINT_BATCH = 1 << 9  # the same where so few are to check
 _MAX_DEPTH = 7  # an edge has 2**7 parts at most
 
 
 def check_edges(
-    world: GridWorld,
-    q: np.ndarray,
-    pairs: np.ndarray,
-    on_progress: Callable[[float], Any] | None = None,
+    world: GridWorld, q: np.ndarray, pairs: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Tell the lengths of edges between nodes, and whether the edges are free.
 
@@ -39,7 +37,6 @@ def check_edges(
         world: the robot in a home.
         q: (N, D) nodes.
         pairs: (M, 2) indices of each edge's nodes.
-        on_progress: called with the share of edges that is done.
 
     Returns:
         Lengths (M,) in the world's metric, and which edges are free (M,) bool.
@@ -67,8 +64,6 @@ def check_edges(
             alive = _survivors(world, q_from, edge, parts, alive, numerator, depth)
         lengths.append(np.asarray(length)[: len(block)])
         free.append(block_free)
-        if on_progress is not None:
-            on_progress((first + len(block)) / len(pairs))
     if not lengths:
         return np.zeros(0, np.float32), np.zeros(0, bool)
     return np.concatenate(lengths), np.concatenate(free)

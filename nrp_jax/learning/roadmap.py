@@ -7,9 +7,7 @@ them and stays close to the true optimum. Letters: ``N`` nodes, ``M`` pairs, ``D
 """
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +60,6 @@ def build_roadmap(
     robot: MobileRobot,
     key: jax.Array,
     num_nodes: int = 10_000,
-    on_progress: Callable[[float], Any] | None = None,
 ) -> Roadmap:
     """Sample free configurations and check the edges between those in each other's window.
 
@@ -73,14 +70,13 @@ def build_roadmap(
         robot: the robot.
         key: random key.
         num_nodes: free samples to draw; those outside the largest connected part are dropped.
-        on_progress: called with the share of edges that is done.
 
     Raises:
         ValueError: hardly any configuration in this home is free.
     """
     q, colliding = _sample(world, key, num_nodes)
     pairs = _neighbors(world, robot, q)
-    length, free = check_edges(world, q, pairs, on_progress)
+    length, free = check_edges(world, q, pairs)
     # The graph of free edges, in both directions.
     a, b = pairs[free].T
     shape = (num_nodes, num_nodes)
