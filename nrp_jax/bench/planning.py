@@ -103,6 +103,7 @@ def run(
                 )
             results.append(result)
             on_result(result)
+    # Costs and expansions count for solved queries alone.
     solved = [result for result in results if result.ok]
     return {
         "n": len(results),

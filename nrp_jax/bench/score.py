@@ -95,6 +95,7 @@ def score_homes(
         roadmap = _roadmap(world, robot, grid, seed, nodes, cache)
         asked = make_queries(world, robot, roadmap, queries, seed)
         q_from, q_goal = roadmap.q[asked.start], roadmap.q[asked.goals[asked.goal]]
+        # All samplers get the same queries.
         for name, sampler in tested.items():
             waypoint = propose_all(sampler, world, q_from, q_goal, seed)
             scores[name].append(optimality(world, robot, roadmap, asked, waypoint))

@@ -121,6 +121,7 @@ def load_examples(
             "give another data set, or the other --task"
         )
     rows = dataset.rows
+    # Which rows, and how good their waypoints are.
     good = rows["ratio"] <= GOOD_RATIO
     if config.kind == "cvae":
         rows = {name: column[good] for name, column in rows.items()}
@@ -206,8 +207,10 @@ def make_batch(
         key: turns and mirrors each query at random, if given. Homes have no preferred direction,
             so that a query stands for eight.
     """
+    # Images, configurations and link frames in the local frames.
     image, q, points = jax.vmap(lambda index: _local(config, examples, index))(chosen)
     if key is not None:
+        # One of the eight symmetries of a square for each query.
         symmetry = jax.random.randint(key, (2, len(chosen)), 0, jnp.array([[4], [2]]))
         quarter, mirror = symmetry[0], symmetry[1] == 1
         image = jax.vmap(features.turn_image)(image, quarter, mirror)

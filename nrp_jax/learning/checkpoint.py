@@ -71,6 +71,7 @@ def load_model(path: str | Path) -> Model:
                 for name in saved.files
                 if name != "description"
             }
+        # JSON has no tuples.
         given = description["config"].items()
         fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given}
         config, info = ModelConfig(**fields), description["info"]

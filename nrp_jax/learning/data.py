@@ -74,11 +74,13 @@ def write_dataset(
     out = Path(out)
     manifest = _open(out, settings)
     wanted = [("train", k) for k in range(homes)] + [("test", k) for k in range(test_homes)]
+    # What is missing, damaged or not yet begun.
     todo = [w for w in wanted if not _intact(out, shard_name(*w), manifest["shards"])]
     done = len(wanted) - len(todo)
     if on_progress is not None:
         on_progress(done, len(wanted))
     for name, entry in make_shards(out, settings, todo, jobs):
+        # The manifest is written after each shard, so that a killed run can be continued.
         manifest["shards"][name] = entry
         manifest["rows"] = sum(shard["rows"] for shard in manifest["shards"].values())
         _write_manifest(out, manifest)
@@ -103,6 +105,7 @@ def load_dataset(folder: str | Path, split: str = "train") -> Dataset:
     if split not in ("train", "test"):
         raise ValueError(f"unknown split '{split}'; have: train, test")
     manifest = _read_manifest(folder)
+    # Rows of other versions mean something else.
     settings = DatasetSettings(**manifest["settings"])
     current = (houses.VERSION, VERSION)
     if (settings.homes_version, settings.rows_version) != current:
@@ -114,6 +117,7 @@ def load_dataset(folder: str | Path, split: str = "train") -> Dataset:
     names = sorted(name for name in manifest["shards"] if name.startswith(split))
     if not names:
         raise ValueError(f"data set '{folder}' has no shards for '{split}' yet; run `nrp data`")
+    # Shard by shard, in the order of the names; homes are numbered in that order.
     grids, parts = [], []
     for home, name in enumerate(names):
         if not _intact(folder, name, manifest["shards"]):
@@ -178,6 +182,7 @@ def _open(out: Path, settings: DatasetSettings) -> dict[str, Any]:
                 f"the data set in '{out}' was made with {key} {manifest['settings'].get(key)}, not "
                 f"{value}; take another folder, or the same settings"
             )
+    # Files that a killed run left.
     for path in out.glob(f"*{UNFINISHED}"):
         path.unlink()
     return manifest

@@ -71,6 +71,7 @@ def goal_features(
     if config.paper:
         direction = jnp.arctan2(place[1], place[0])
         return jnp.append(configuration_features(config, robot, q, points), direction)
+    # Far goals move towards the start, together with their link frames.
     distance = jnp.sqrt(jnp.sum(place**2) + 1e-6)
     back = place * (jnp.minimum(1.0, MAX_GOAL_DISTANCE / distance) - 1.0)
     q, points = q.at[:2].add(back), points.at[:, :2].add(back)
@@ -87,6 +88,7 @@ def to_configuration(config: ModelConfig, robot: MobileRobot, features: jax.Arra
     linear, cosine, sine = jnp.split(
         features[..., : num + is_angle.sum()], [num - is_angle.sum(), num], axis=-1
     )
+    # Features hold sliding joints first, then turning ones: back to the robot's order.
     order = np.argsort(np.concatenate([np.flatnonzero(~is_angle), np.flatnonzero(is_angle)]))
     return jnp.concatenate([linear, jnp.arctan2(sine, cosine)], axis=-1)[..., order]
 
@@ -135,8 +137,9 @@ def surroundings(field: DistanceField) -> jax.Array:
     Distances beyond ``MAX_CLEARANCE`` count as that.
     """
     planar = field.values.shape[2] == 1
+    # The lattice points at the centers of the cells; the field has a rim of one cell in x and y.
     fine = field.fine
-    first = fine + fine // 2  # the field has a rim of one cell in x and y
+    first = fine + fine // 2
     inside = field.values[first:-first:fine, first:-first:fine]
     return jnp.minimum(inside if planar else inside[:, :, fine // 2 :: fine], MAX_CLEARANCE)
 
@@ -155,6 +158,7 @@ def turn_configuration(
 
     The snake's joints count clockwise from +y, the Fetch's heading counts from +x to +y.
     """
+    # Mirroring y changes the sign of some joints, and turns the snake's first joint by half a turn.
     if robot.planar:
         sign = np.array([1, -1, *[-1] * 6])
         offset = np.array([0, 0, np.pi, *[0] * 5])
@@ -165,6 +169,7 @@ def turn_configuration(
         offset = np.zeros(len(sign))
         clockwise = 1
     q = jnp.where(mirror, sign * q + offset, q)
+    # A quarter turn changes the heading and the place, no other joint.
     heading = q[..., HEADING] + clockwise * quarter * (jnp.pi / 2)
     heading = jnp.mod(heading + jnp.pi, 2 * jnp.pi) - jnp.pi
     return _turn(q.at[..., HEADING].set(heading), quarter)

@@ -98,7 +98,6 @@ def train(
     )
     store = CheckpointStore(out / "checkpoint")
     state, best, history = store.restore(state)
-
     update = _make_update(config, robot, module, optimizer, settings)
 
     def export() -> Model:
@@ -108,6 +107,7 @@ def train(
         save_model(model, out / "model.npz")
         return model
 
+    # Epochs that are not done yet.
     bar = tqdm(
         range(len(history), settings.epochs),
         initial=len(history),
@@ -126,6 +126,7 @@ def train(
         for chosen in order[: len(order) // size * size].reshape(-1, size):
             state, loss = update(state, examples, jnp.asarray(chosen))
             losses.append(loss)
+        # The held-out homes decide whether this epoch is the best so far.
         figures = validate(config, module, robot, state.variables, examples, validation)
         if not np.isfinite(figures["loss"]):
             store.close()

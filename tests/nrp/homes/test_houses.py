@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from nrp_jax.homes import houses
+from nrp_jax.homes.figure import save_figure
 from nrp_jax.homes.furniture import HEIGHT, MAKERS
 from nrp_jax.homes.grid import load_map
 
@@ -141,5 +142,5 @@ def test_save_and_load(tmp_path, homes):
 
 
 def test_figure(tmp_path, homes):
-    houses.save_figure(homes[:3], tmp_path / "homes.png")
+    save_figure(homes[:3], tmp_path / "homes.png")
     assert (tmp_path / "homes.png").stat().st_size > 20_000
