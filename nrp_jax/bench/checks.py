@@ -58,7 +58,7 @@ class SphereLoop:
         apart = np.linalg.norm(center[first] - center[second], axis=1)
         if (apart < self.radius[first] + self.radius[second]).any():
             return False
-        if planar_boxes_overlap(self.robot, pose):
+        if robot_plates_overlap(self.robot, pose):
             return False
         # The arm against the floor, all spheres against the cells, and the base.
         if (center[self.is_arm, 2] <= self.radius[self.is_arm]).any():
@@ -111,19 +111,19 @@ class SphereLoop:
         return not self._hits(position, radius, top=height)
 
 
-def planar_boxes_overlap(robot: MobileRobot, poses: np.ndarray) -> bool:
-    """Whether checked boxes overlap: no side of either has all corners of the other beyond it."""
-    if robot.planar_boxes is None:
+def robot_plates_overlap(robot: MobileRobot, poses: np.ndarray) -> bool:
+    """Whether checked plates overlap: no side of either has all corners of the other beyond it."""
+    if robot.plates is None:
         return False
     corners = []
     for link, center, half in zip(
-        robot.planar_boxes.link,
-        *(np.asarray(a) for a in (robot.planar_boxes.center, robot.planar_boxes.half)),
+        robot.plates.link,
+        *(np.asarray(a) for a in (robot.plates.center, robot.plates.half)),
         strict=True,
     ):
         local = center + half * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
         corners.append(local @ poses[link, :2, :2].T + poses[link, :2, 3])
-    for i, j in robot.planar_boxes.pairs:
+    for i, j in robot.plates.pairs:
         both = (corners[i], corners[j])
         normals = [turned for c in both for turned in np.diff(c[:3], axis=0)]
         if all(

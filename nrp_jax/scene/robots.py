@@ -51,7 +51,7 @@ class MobileRobot:
     self_collision_pairs: (
         jax.Array
     )  # (P, 2) i32 indices into ``cover``: which are checked against each other
-    planar_boxes: PlanarBoxes | None  # checked against each other instead, if there are any
+    plates: PlanarBoxes | None  # checked against each other instead, if there are any
     footprint: Footprint | None
     feature_link: jax.Array  # (F,) i32
     feature_point: jax.Array  # (F, 3) in the link's frame [m]
@@ -129,7 +129,7 @@ def load_robot(name: str) -> MobileRobot:
         self_collision_pairs=jnp.asarray(
             _checked_pairs(model, owner[: 0 if planar else None]), jnp.int32
         ),
-        planar_boxes=_planar_boxes(model, body_link, body_in_link) if planar else None,
+        plates=_plates(model, body_link, body_in_link) if planar else None,
         footprint=_footprint(model, body_link) if is_footprint.any() else None,
         feature_link=jnp.asarray(body_link[model.site_bodyid], jnp.int32),
         feature_point=jnp.asarray(points, jnp.float32),
@@ -151,9 +151,7 @@ def _footprint(model: mujoco.MjModel, body_link: np.ndarray) -> Footprint:
     )
 
 
-def _planar_boxes(
-    model: mujoco.MjModel, body_link: np.ndarray, body_in_link: np.ndarray
-) -> PlanarBoxes:
+def _plates(model: mujoco.MjModel, body_link: np.ndarray, body_in_link: np.ndarray) -> PlanarBoxes:
     geoms = np.flatnonzero(model.geom_contype)
     body = model.geom_bodyid[geoms]
     center = np.einsum("nij,nj->ni", body_in_link[body, :3, :3], model.geom_pos[geoms])

@@ -1,4 +1,4 @@
-"""A robot in a home: which configurations are free, and the edges between them."""
+"""A robot in a home: is this configuration free, how far is it to that one, and on which way."""
 
 import dataclasses
 from typing import Any
@@ -8,51 +8,52 @@ import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax.homes.grid import Grid
-from nrp_jax.scene.car import CarEdges, norm
+from nrp_jax.scene import reeds_shepp
 from nrp_jax.scene.field import DistanceField, clearance_bound, make_field
 from nrp_jax.scene.robots import MobileRobot, PlanarBoxes
 from vrrt_jax.core.edges import StraightLineEdges, joint_steps
 from vrrt_jax.core.types import pytree, static
 from vrrt_jax.robots.kinematics import Chain, Spheres, link_poses, place, placement
 
-ARM_WEIGHT = {"snake": 0.167, "fetch": 0.125}  # of the paper's metrics [m/rad]
-RESOLUTION = {"snake": 0.1, "fetch": 0.2}  # largest sub-steps, as in the paper [m] and [rad]
+ARM_WEIGHT = {"snake": 0.167, "fetch": 0.125}  # of the paper's metrics
+RESOLUTION = {"snake": 0.1, "fetch": 0.2}  # sub-steps of the paper [m] and [rad]
 TURNING_RADIUS = 0.1  # of the Fetch's base [m]
+SHORTLIST = 16  # nodes for which the length of a curve is computed
 
 
 @pytree
 class RoundBase:
-    """A round base and the cells that are low enough to block it."""
+    """A round base among the cells that are low enough to be in its way."""
 
-    field: DistanceField  # planar, of the cells below the base's height
+    field: DistanceField  # planar
     radius: jax.Array  # () [m]
     height: jax.Array  # () [m]
-    link: int = static()  # index of the link that the base is
+    link: int = static()
 
 
 @pytree
 class GridWorld(StraightLineEdges):
-    """A robot on a sliding base in a home, as planners see it; edges are straight.
+    """What planners ask about a robot on a sliding base in a home; edges are straight.
 
-    The length of an edge is that of the base's path plus ``arm_weight`` times that of the arm's.
-    Its sub-steps move no joint by more than ``resolution``.
+    An edge's length is that of the base's way plus ``arm_weight`` times that of the arm's; its
+    sub-steps move no joint by more than ``resolution``.
     """
 
     chain: Chain
-    collision_spheres: jax.Array  # (L * 12, 3 n) placement of the n spheres that cover the robot
-    collision_radius: jax.Array  # (n,) of the spheres [m]
-    # (n,) lowest height of the spheres' centers [m], -inf for spheres that may touch the floor
-    floor: jax.Array
-    planar_boxes: PlanarBoxes | None  # parts checked against each other as boxes, not as spheres
-    # (m, n) distance at which the last m spheres touch the others [m], 0 for pairs not checked
-    contact_distance: jax.Array
+    collision_spheres: jax.Array  # (L * 12, 3 n) placement of the covering spheres
+    collision_radius: jax.Array  # (n,) [m]
+    floor: jax.Array  # (n,) lowest height of their centers, -inf if they may touch the floor [m]
+    plates: PlanarBoxes | None  # checked against each other instead
+    contact_distance: (
+        jax.Array
+    )  # (m, n) at which the last m touch others, 0 for pairs not checked [m]
     base: RoundBase | None
     field: DistanceField
     lower: jax.Array  # (D,)
     upper: jax.Array  # (D,)
     is_continuous: jax.Array  # (D,) bool
-    arm_weight: jax.Array  # () meters that a radian of the arm counts for
-    resolution: jax.Array  # () largest sub-step of any joint between two checks [m] or [rad]
+    arm_weight: jax.Array  # () meters a radian of the arm counts for
+    resolution: jax.Array  # () longest sub-step of any joint [m] or [rad]
 
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`is_free`."""
@@ -73,34 +74,108 @@ class GridWorld(StraightLineEdges):
 
     def length(self, edge: jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`."""
-        return norm(edge[..., :2]) + self.arm_weight * norm(edge[..., 2:])
+        return _norm(edge[..., :2]) + self.arm_weight * _norm(edge[..., 2:])
 
     def span(self, edge: jax.Array) -> jax.Array:
-        """The largest step (...) of any joint along an edge [m] or [rad]."""
+        """The longest way (...) of any joint along an edge [m] or [rad]."""
         return jnp.max(jnp.abs(edge), axis=-1)
 
     def steer(self, q_from: jax.Array, target: jax.Array, num_steps: int) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`."""
         inside = jnp.where(self.is_continuous, target, jnp.clip(target, self.lower, self.upper))
         edge = self.edge(q_from, inside)
-        most = num_steps * self.resolution
-        return self.truncate(edge, jnp.minimum(1.0, most / jnp.maximum(self.span(edge), 1e-9)))
+        longest = num_steps * self.resolution
+        return self.truncate(edge, jnp.minimum(1.0, longest / jnp.maximum(self.span(edge), 1e-9)))
 
     def is_resolved(self, edge: jax.Array, num_steps: int | jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`."""
         return self.span(edge) <= num_steps * self.resolution * (1 + 1e-5)
 
     def parts(self, edge: Any, most: int) -> jax.Array:
-        """The fewest parts (...) of an edge that are fine enough; ``most + 1`` if it takes more."""
+        """Fewest parts (...) of an edge that are resolved each; ``most + 1`` if it takes more."""
         enough = jax.vmap(self.is_resolved, (None, 0))(edge, jnp.arange(1, most + 1))
         return 1 + jnp.sum(~enough, axis=0)
 
 
 @pytree
-class CarWorld(CarEdges, GridWorld):
+class CarEdge:
+    """A drive of the base, while the arm goes straight."""
+
+    curve: reeds_shepp.Curve
+    arm: jax.Array  # (..., D - 3) step
+    target: jax.Array  # (..., D) where the whole edge leads
+    done: jax.Array  # (...) 1 while nothing has been cut off
+
+
+@pytree
+class CarWorld(GridWorld):
     """The same with a base that turns and drives like a car, forwards and in reverse."""
 
     radius: jax.Array  # () smallest turning radius [m]
+
+    def distance(self, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
+        """See :class:`vrrt_jax.core.edges.Space`."""
+        drive = reeds_shepp.length(q_a[..., :3], q_b[..., :3], self.radius)
+        arm = StraightLineEdges.edge(self, q_a, q_b)[..., 3:]
+        return drive + self.arm_weight * _norm(arm)
+
+    def distances(self, nodes: jax.Array, q: jax.Array, among: jax.Array) -> jax.Array:
+        """See :class:`vrrt_jax.core.edges.Space`; +inf beyond a shortlist of nearest nodes.
+
+        The shortlist goes by a bound: no drive is shorter than the straight line, nor than its turn
+        at the smallest radius. The nearest is nearly always in it.
+        """
+        line, arm = jnp.zeros((2, q.shape[0], nodes.shape[0]), q.dtype)
+        for joint in range(q.shape[1]):
+            step = joint_steps(self, nodes, q, joint)
+            if joint == 2:
+                turn = self.radius * jnp.abs(step)
+                continue
+            line, arm = (line + step**2, arm) if joint < 2 else (line, arm + step**2)
+        bound = jnp.maximum(jnp.sqrt(line), turn) + self.arm_weight * jnp.sqrt(arm)
+        bound = jnp.where(among, bound, jnp.inf)
+        nearest, index = _shortlist(bound)
+        exact = self.distance(q[:, None], nodes[index])
+        exact = jnp.where(jnp.isfinite(nearest), exact, jnp.inf)
+        row = jnp.arange(q.shape[0])[:, None]
+        return jnp.full(bound.shape, jnp.inf, q.dtype).at[row, index].set(exact)
+
+    def edge(self, q_from: jax.Array, q_to: jax.Array) -> CarEdge:
+        """See :class:`vrrt_jax.core.edges.Space`."""
+        step = StraightLineEdges.edge(self, q_from, q_to)
+        return CarEdge(
+            curve=reeds_shepp.shortest(q_from[..., :3], q_to[..., :3], self.radius),
+            arm=step[..., 3:],
+            target=jnp.broadcast_to(q_to, step.shape),
+            done=jnp.ones(step.shape[:-1], step.dtype),
+        )
+
+    def truncate(self, edge: CarEdge, fraction: jax.Array) -> CarEdge:
+        """See :class:`vrrt_jax.core.edges.Space`."""
+        return CarEdge(
+            curve=reeds_shepp.cut(edge.curve, fraction, self.radius),
+            arm=edge.arm * fraction[..., None],
+            target=edge.target,
+            done=edge.done * fraction,
+        )
+
+    def length(self, edge: CarEdge) -> jax.Array:
+        """See :class:`vrrt_jax.core.edges.Space`."""
+        return self._drive(edge) + self.arm_weight * _norm(edge.arm)
+
+    def span(self, edge: CarEdge) -> jax.Array:
+        """The longest way (...) of base, with what it turns, or any joint [m] or [rad]."""
+        base = reeds_shepp.extent(edge.curve, self.radius)
+        return jnp.maximum(base, jnp.max(jnp.abs(edge.arm), axis=-1))
+
+    def end(self, q_from: jax.Array, edge: CarEdge) -> jax.Array:
+        """See :class:`vrrt_jax.core.edges.Space`; the whole edge ends at its target exactly."""
+        base = reeds_shepp.follow(q_from[..., :3], edge.curve, self.radius)
+        q = jnp.concatenate([base, q_from[..., 3:] + edge.arm], axis=-1)
+        return jnp.where((edge.done >= 1)[..., None], edge.target, q)
+
+    def _drive(self, edge: CarEdge) -> jax.Array:
+        return reeds_shepp.curve_length(edge.curve) * self.radius
 
 
 def is_free(world: GridWorld, q: jax.Array) -> jax.Array:
@@ -116,8 +191,8 @@ def is_free(world: GridWorld, q: jax.Array) -> jax.Array:
     free = jnp.all(apart >= world.contact_distance**2)
     free &= jnp.all(clearance_bound(world.field, centers) > world.collision_radius)
     free &= jnp.all(centers[2] > world.floor)
-    if world.planar_boxes is not None:
-        free &= _boxes_apart(world.planar_boxes, poses)
+    if world.plates is not None:
+        free &= _plates_apart(world.plates, poses)
     if world.base is not None:
         free &= _base_is_free(world.base, poses, centers, world.collision_radius, world.floor)
     return free
@@ -126,21 +201,16 @@ def is_free(world: GridWorld, q: jax.Array) -> jax.Array:
 batch_is_free = jax.jit(jax.vmap(is_free, (None, 0)))  # of q (n, D), for the host
 
 
-def _boxes_apart(boxes: PlanarBoxes, poses: jax.Array) -> jax.Array:
-    """Whether no two of the checked boxes overlap, () bool, for link poses (L, 4, 4).
-
-    Two rectangles are apart exactly if a side of one separates them.
-    """
-    pose = poses[jnp.array(boxes.link)]
+def _plates_apart(plates: PlanarBoxes, poses: jax.Array) -> jax.Array:
+    """Whether no two of the checked plates overlap: some side separates them."""
+    pose = poses[jnp.array(plates.link)]
     cosine, sine = pose[:, 0, 0], pose[:, 1, 0]
-    center = jnp.einsum("mij,mj->mi", pose[:, :2, :2], boxes.center) + pose[:, :2, 3]
-    # For each pair: cosine and sine of the angle between the boxes, and the step between centers.
-    pairs = jnp.array(boxes.pairs).T
-    (c_i, c_j), (s_i, s_j), (half_i, half_j) = cosine[pairs], sine[pairs], boxes.half[pairs]
+    center = jnp.einsum("mij,mj->mi", pose[:, :2, :2], plates.center) + pose[:, :2, 3]
+    pairs = jnp.array(plates.pairs).T
+    (c_i, c_j), (s_i, s_j), (half_i, half_j) = cosine[pairs], sine[pairs], plates.half[pairs]
     turned = jnp.abs(jnp.stack([c_i * c_j + s_i * s_j, c_i * s_j - s_i * c_j]))
     dx, dy = (center[pairs[1]] - center[pairs[0]]).T
-    apart = jnp.zeros(len(boxes.pairs), bool)
-    # Along both axes of either box: are the centers farther apart than the half sizes together?
+    apart = jnp.zeros(len(plates.pairs), bool)
     for (c, s), own, other in (((c_i, s_i), half_i, half_j), ((c_j, s_j), half_j, half_i)):
         ahead, beside = jnp.abs(c * dx + s * dy), jnp.abs(c * dy - s * dx)
         apart |= ahead > own[:, 0] + other[:, 0] * turned[0] + other[:, 1] * turned[1]
@@ -151,15 +221,7 @@ def _boxes_apart(boxes: PlanarBoxes, poses: jax.Array) -> jax.Array:
 def _base_is_free(
     base: RoundBase, poses: jax.Array, centers: jax.Array, radius: jax.Array, floor: jax.Array
 ) -> jax.Array:
-    """Whether the base, a cylinder, touches neither a cell nor the arm, () bool.
-
-    Args:
-        base: of the robot.
-        poses: (L, 4, 4) of the links.
-        centers: (3, n) of the covering spheres [m].
-        radius: (n,) of the covering spheres [m].
-        floor: (n,) from the world; spheres of the arm are those with a finite height.
-    """
+    """Whether a cylinder touches neither a cell nor the spheres that must not touch the floor."""
     position = poses[base.link, :3, 3:]
     beside = jnp.sqrt(jnp.sum((centers[:2] - position[:2]) ** 2, axis=0)) - base.radius
     above = centers[2] - base.height
@@ -183,8 +245,8 @@ def build_world(
     Args:
         robot: from :func:`nrp_jax.load_robot`.
         grid: from :func:`nrp_jax.load_map` or a generator; the snake sees its planar map.
-        wrap: joints without limits turn the shorter way round; otherwise they are intervals, as
-            in the paper. A heading always wraps.
+        wrap: joints without limits turn the short way round; otherwise they are intervals, as in
+            the paper. A heading always wraps.
         resolution: longest sub-step of any joint between two collision checks [m] or [rad]; the
             paper's by default.
         arm_weight: meters that a radian of the arm counts for in the metric; the paper's by
@@ -204,10 +266,8 @@ def build_world(
         if not value > 0:
             raise ValueError(f"{name} is {value}; expected a positive number, such as 0.1")
     grid = _fitting(robot.planar, grid)
-    # Spheres of the arm must stay above the floor by their radius.
     is_arm = np.asarray(robot.collision_spheres.link) > robot.base_dim + 1
     floor = np.where(is_arm & (not robot.planar), robot.collision_spheres.radius, -np.inf)
-    # The base's joints are bounded by the map, and by half a turn each way.
     turn = [np.pi] * (robot.base_dim - 2)
     is_base = np.arange(robot.num_joints) < robot.base_dim
     corner = np.array(grid.origin[:2])
@@ -216,8 +276,8 @@ def build_world(
         "collision_spheres": _placement(robot.collision_spheres, robot.chain),
         "collision_radius": robot.collision_spheres.radius,
         "floor": jnp.asarray(floor, jnp.float32),
-        "planar_boxes": robot.planar_boxes,
-        "contact_distance": jnp.asarray(_contact_distance(robot)),
+        "plates": robot.plates,
+        "contact_distance": jnp.asarray(_reach(robot)),
         "base": _round_base(robot, grid),
         "field": make_field(grid),
         "lower": _float(np.concatenate([corner, np.negative(turn), robot.lower])),
@@ -251,12 +311,17 @@ def with_grid(world: GridWorld, grid: Grid) -> GridWorld:
     )
 
 
-def _fitting(planar: bool, grid: Grid) -> Grid:
-    """The map as a robot needs it: flat for a planar robot.
+def _norm(step: jax.Array) -> jax.Array:
+    return jnp.sqrt(jnp.sum(step**2, axis=-1))
 
-    Raises:
-        ValueError: a planar map for a robot that is not.
-    """
+
+def _shortlist(bound: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Smallest bounds (B, k) of (B, N) and where they are."""
+    smallest, index = jax.lax.top_k(-bound, min(SHORTLIST, bound.shape[1]))
+    return -smallest, index
+
+
+def _fitting(planar: bool, grid: Grid) -> Grid:
     if planar:
         return grid.flatten()
     if grid.planar:
@@ -267,18 +332,17 @@ def _fitting(planar: bool, grid: Grid) -> Grid:
     return grid
 
 
-def _contact_distance(robot: MobileRobot) -> np.ndarray:
-    """Distances (m, n) [m] at which the last m of n spheres touch others; 0 for unchecked pairs.
-
-    m is as small as the pairs allow.
-    """
-    radius = np.asarray(robot.collision_spheres.radius)
-    first, second = np.asarray(robot.self_collision_pairs).T
+def _reach(robot: MobileRobot) -> np.ndarray:
+    """Sums of the radii (m, n) of pairs of the last m of n spheres with any; 0 if not checked."""
+    radius, (first, second) = (
+        np.asarray(robot.collision_spheres.radius),
+        np.asarray(robot.self_collision_pairs).T,
+    )
     if not len(first):
         return np.zeros((0, len(radius)), np.float32)
-    contact = np.zeros((len(radius),) * 2, np.float32)
-    contact[second, first] = radius[first] + radius[second]
-    return contact[second.min() :]
+    reach = np.zeros((len(radius),) * 2, np.float32)
+    reach[second, first] = radius[first] + radius[second]
+    return reach[second.min() :]
 
 
 def _round_base(robot: MobileRobot, grid: Grid) -> RoundBase | None:

@@ -117,7 +117,7 @@ def test_cover_contains_the_primitives_at_any_configuration(robot, rng):
 
 def test_only_links_of_one_layer_of_the_snake_are_checked():
     snake = nrp_jax.load_robot("snake")
-    assert sorted(snake.planar_boxes.pairs) == [(0, 2), (0, 4), (1, 3), (1, 5), (2, 4), (3, 5)]
+    assert sorted(snake.plates.pairs) == [(0, 2), (0, 4), (1, 3), (1, 5), (2, 4), (3, 5)]
 
 
 def test_share_of_postures_that_hit_themselves(rng):
