@@ -230,6 +230,14 @@ def make_batch(
     )
 
 
+def empty_batch(config: ModelConfig, robot: MobileRobot, examples: Examples) -> Batch:
+    """A batch of one query that holds zeros, to initialize networks with its shapes."""
+    shapes = jax.eval_shape(
+        lambda examples: make_batch(config, robot, examples, jnp.zeros(1, jnp.int32)), examples
+    )
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+
 def describe(config: ModelConfig, robot: MobileRobot, q: jax.Array, points: jax.Array) -> jax.Array:
     """Features (n, C, E) of local configurations (n, C, D) with link frames (n, C, F, 3)."""
     one = functools.partial(features.configuration_features, config, robot)

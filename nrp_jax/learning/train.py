@@ -15,7 +15,7 @@ import optax
 from tqdm import tqdm
 
 from nrp_jax.learning import models
-from nrp_jax.learning.batches import Examples, load_examples, make_batch
+from nrp_jax.learning.batches import Examples, empty_batch, load_examples, make_batch
 from nrp_jax.learning.checkpoint import Model, build_module, save_model
 from nrp_jax.learning.data import fingerprint, load_dataset
 from nrp_jax.learning.models import ModelConfig
@@ -82,7 +82,7 @@ def train(
     training, validation = split_by_home(np.asarray(examples.home), settings)
     out = claim_output_dir(Path(out), {**parts, "data": stamp})
     # The network, the optimizer, and a random or restored state.
-    sample = make_batch(config, robot, examples, jnp.zeros(1, jnp.int32))
+    sample = empty_batch(config, robot, examples)
     module = build_module(config, sample.waypoints.shape[-1])
     size = min(settings.batch, len(training))
     steps = settings.epochs * (len(training) // size)

@@ -9,7 +9,7 @@ import pytest
 from nrp_synthetic import free, random_grid
 
 from nrp_jax import samplers
-from nrp_jax.learning.batches import make_batch, make_examples
+from nrp_jax.learning.batches import empty_batch, make_examples
 from nrp_jax.learning.checkpoint import Model, build_module, save_model
 from nrp_jax.learning.models import ModelConfig
 from nrp_jax.learning.objective import init
@@ -23,7 +23,7 @@ def random_model(kind: str, seed: int = 0) -> Model:
     rows = {"q_start": q, "q_goal": q, "waypoint": q, "home": np.zeros(1), "query": np.zeros(1)}
     grid = random_grid(0)
     examples = make_examples(config, robot, [grid], rows, target=np.ones(1), weight=np.ones(1))
-    batch = make_batch(config, robot, examples, jnp.zeros(1, jnp.int32))
+    batch = empty_batch(config, robot, examples)
     outputs = batch.waypoints.shape[-1]
     variables = init(config, build_module(config, outputs), batch, jax.random.key(seed))
     return Model(config=config, variables=variables, info={"num_outputs": outputs})

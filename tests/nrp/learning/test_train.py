@@ -123,7 +123,8 @@ def test_the_generator_learns(rows, tmp_path):
     robot, examples = examples_of(config, rows)
     settings = dataclasses.replace(SETTINGS, epochs=24, learning_rate=8e-3)
     model = train(config, robot, examples, tmp_path, settings=settings, progress=False)
-    batch = make_batch(config, robot, examples, np.arange(len(examples.home)))
+    compiled = jax.jit(make_batch, static_argnums=0)
+    batch = compiled(config, robot, examples, np.arange(len(examples.home)))
     spread = np.asarray(batch.waypoints)[np.asarray(batch.weight) > 0].var(axis=0).mean()
     assert -model.info["best"]["quality"] < 0.9 * spread
 
