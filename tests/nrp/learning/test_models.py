@@ -1,6 +1,7 @@
 """Features, symmetries and architectures of the learned samplers."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from nrp_jax.learning import features, local_map, models
 from nrp_jax.learning.batches import local_image, relations, surrounding_map
 from nrp_jax.learning.checkpoint import Model, build_module, check_model, load_model, save_model
 from nrp_jax.learning.models import ModelConfig
-from nrp_jax.scene.robots import link_features, load_robot
+from nrp_jax.scene.robots import batch_link_features, load_robot
 from nrp_jax.scene.world import build_world, is_free
 from vrrt_jax.core.planners.rrt import sample_configurations
 
@@ -100,7 +101,7 @@ def test_turned_homes_are_as_free_as_before(task):
     grid = random_grid(3, size=48, height=SIZES[task][2], boxes=20)
     world, middle = build_world(robot, grid), jnp.array([2.4, 2.4])
     q = sample_configurations(world, jax.random.key(0), 400)
-    frames = jax.jit(jax.vmap(lambda q: link_features(robot, q)))
+    frames = functools.partial(batch_link_features, robot)
     free = jax.jit(jax.vmap(is_free, (None, 0)))
     before, local = np.asarray(free(world, q)), features.to_local(q, middle)
     shift = jnp.append(middle, 0.0)
@@ -146,8 +147,8 @@ def test_surroundings_are_read_where_the_robot_would_pass():
     goal = jnp.full(8, 0.45).at[2].set(2 * np.pi - 1)  # the first joint goes round
     waypoint = jnp.zeros(8).at[:2].set(jnp.array([0.45, -0.45]))  # straight along +y, as the start
     q = jnp.stack([jnp.zeros(8), goal, waypoint])
-    points = jax.vmap(lambda q: link_features(robot, q))(q)
-    read = np.asarray(relations(robot, image, q, points))[0]
+    points = batch_link_features(robot, q)
+    read = np.asarray(jax.jit(relations)(robot, image, q, points))[0]
     cells = []
     for fraction in (0.25, 0.5, 0.75, 1.0):
         for along in (*(0.12 * np.arange(1, 7)), 0.0):
@@ -165,9 +166,10 @@ def test_candidates_are_judged_one_by_one():
     inputs = [jax.random.normal(k, x.shape) for k, x in zip(keys, inputs, strict=True)]
     module = build_module(config, 0)
     variables = jax.jit(module.init)(jax.random.key(0), *inputs)
-    together = module.apply(variables, *inputs)
+    apply = jax.jit(module.apply)
+    together = apply(variables, *inputs)
     assert together.shape == (2, 5) and float(jnp.std(together)) > 0
-    alone = module.apply(variables, *inputs[:3], *(x[:, 2:3] for x in inputs[3:]))
+    alone = apply(variables, *inputs[:3], *(x[:, 2:3] for x in inputs[3:]))
     np.testing.assert_allclose(alone[:, 0], together[:, 2], atol=1e-5)
 
 
