@@ -17,14 +17,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     from nrp_jax.bench import checks, planning, score
-    from nrp_jax.homes import houses
+    from nrp_jax.homes import figure
     from nrp_jax.learning import data, train
 
     parser = command.Parser(
         prog="nrp", description="Motion planning in homes, with learned samplers."
     )
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (houses, data, train, score):
+    for module in (figure, data, train, score):
         module.add_arguments(commands)
     _add_plan(commands)
     bench = commands.add_parser("bench", help="measure speed and success")

@@ -1,4 +1,4 @@
-"""Figures: a home from above, the tree that was grown in it, and the robot along its path."""
+"""Figures of plans: a home from above, the search tree in it, and the robot along its path."""
 
 from pathlib import Path
 
@@ -13,9 +13,9 @@ from nrp_jax.planner import PlanResult
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld
 
-_EDGE_POINTS = 9
-_SHOWN = 4000  # edges of a tree at most
-_COLOURS = {"map": "#3b4252", "above": "#c3c9d4", "tree": "#7aa6c2", "path": "#d1495b"}
+_EDGE_POINTS = 9  # drawn along an edge
+_MAX_EDGES = 4000  # drawn of a tree
+_COLORS = {"map": "#3b4252", "above": "#c3c9d4", "tree": "#7aa6c2", "path": "#d1495b"}
 
 
 def outlines(robot: MobileRobot, q: np.ndarray) -> list[np.ndarray]:
@@ -39,19 +39,21 @@ def outlines(robot: MobileRobot, q: np.ndarray) -> list[np.ndarray]:
 
 
 def draw_map(axes, grid: Grid) -> None:
-    """Draw a map from above; cells that are solid above 0.4 m only are lighter.
+    """Draw a map from above; cells that are solid only above 0.4 m are lighter.
 
-    For a planar robot give what it sees of the map, ``grid.flatten()``.
+    Args:
+        axes: of matplotlib.
+        grid: the map; for a planar robot the part that it meets, ``grid.flatten()``.
     """
     low = grid.flatten(z_high=0.4).occupied[:, :, 0]
     seen = grid.occupied.any(axis=2)
-    view_color_gradient = np.ones((*seen.shape, 3))
-    view_color_gradient[seen] = _rgb(_COLOURS["above"])
-    view_color_gradient[low & seen] = _rgb(_COLOURS["map"])
+    image = np.ones((*seen.shape, 3))
+    image[seen] = _rgb(_COLORS["above"])
+    image[low & seen] = _rgb(_COLORS["map"])
     left, bottom = grid.origin[:2]
     right, top = np.array(grid.origin[:2]) + grid.size[:2]
     axes.imshow(
-        np.swapaxes(view_color_gradient, 0, 1),
+        np.swapaxes(image, 0, 1),
         origin="lower",
         extent=(left, right, bottom, top),
         interpolation="nearest",
@@ -72,13 +74,14 @@ def draw_robot(axes, robot: MobileRobot, q: np.ndarray, color: str, alpha: float
 
 
 def draw_tree(axes, world: GridWorld, result: PlanResult) -> None:
-    """Draw where the base goes along the edges of a tree."""
+    """Draw the path of the base along the edges of the search tree."""
     from matplotlib.collections import LineCollection
 
     size = int(result.tree.size)
     parent = np.asarray(result.tree.parent)[:size]
+    # Every edge, or evenly spaced ones of a large tree, as a line of several points.
     child = np.flatnonzero(parent >= 0)
-    child = child[:: max(1, -(-len(child) // _SHOWN))]
+    child = child[:: max(1, -(-len(child) // _MAX_EDGES))]
     if not len(child):
         return
     q = np.asarray(result.tree.q)
@@ -87,7 +90,7 @@ def draw_tree(axes, world: GridWorld, result: PlanResult) -> None:
         world, q[parent[child]], q[child]
     )
     axes.add_collection(
-        LineCollection(list(np.asarray(lines)[..., :2]), colors=_COLOURS["tree"], linewidths=0.5)
+        LineCollection(list(np.asarray(lines)[..., :2]), colors=_COLORS["tree"], linewidths=0.5)
     )
 
 
@@ -122,11 +125,11 @@ def save_plan(
     draw_map(axes, grid.flatten() if robot.planar else grid)
     draw_tree(axes, world, result)
     trajectory = result.trajectory
-    axes.plot(*trajectory[:, :2].T, color=_COLOURS["path"], linewidth=1.5)
+    axes.plot(*trajectory[:, :2].T, color=_COLORS["path"], linewidth=1.5)
     for index in np.linspace(0, len(trajectory) - 1, min(robots, len(trajectory))).astype(int):
         draw_robot(axes, robot, trajectory[index], "#e9c46a", alpha=0.5)
     draw_robot(axes, robot, trajectory[0], "#2a9d8f")
-    draw_robot(axes, robot, q_goal, _COLOURS["path"])
+    draw_robot(axes, robot, q_goal, _COLORS["path"])
     axes.set_title(
         f"{result.status.name.lower()}: {result.cost:.1f} m, {result.expansions} expansions, "
         f"{result.timing['search_s']:.2f} s search"
@@ -136,7 +139,7 @@ def save_plan(
 
 
 def _outer_points(kind: mujoco.mjtGeom, size: np.ndarray) -> np.ndarray:
-    """Points (n, 3) whose hull is about the geom, in its frame."""
+    """Points (n, 3) whose convex hull is nearly the geom, in its frame [m]."""
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
         return np.array(np.meshgrid(*[(-h, h) for h in size])).reshape(3, -1).T
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
@@ -159,4 +162,5 @@ def _outer_points(kind: mujoco.mjtGeom, size: np.ndarray) -> np.ndarray:
 
 
 def _rgb(color: str) -> tuple[float, ...]:
+    """Red, green and blue in [0, 1] of a color such as "#3b4252"."""
     return tuple(int(color[i : i + 2], 16) / 255 for i in (1, 3, 5))

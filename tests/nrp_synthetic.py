@@ -1,4 +1,6 @@
-"""A small data set with a real rule behind it: can the base go straight to the waypoint?"""
+"""Small maps and data sets, and what several test files compute in plain numpy."""
+
+import heapq
 
 import numpy as np
 
@@ -28,7 +30,10 @@ def free(world, q: np.ndarray) -> np.ndarray:
 
 
 def synthetic_rows(homes: int = 4, queries: int = 24, waypoints: int = 6, seed: int = 0):
-    """Grids and rows of the snake; ``good`` tells whether the straight edge is free."""
+    """Grids and rows of the snake; ``good`` tells whether the straight edge is free.
+
+    So there is a rule to learn: can the robot go straight to the waypoint?
+    """
     robot = load_robot("snake")
     grids = [random_grid(seed + k) for k in range(homes)]
     rows = {name: [] for name in ("q_start", "q_goal", "waypoint", "home", "query", "good")}
@@ -52,3 +57,29 @@ def synthetic_rows(homes: int = 4, queries: int = 24, waypoints: int = 6, seed: 
         rows["query"].append(np.repeat(np.arange(queries), waypoints))
         rows["good"].append(good)
     return robot, grids, {name: np.concatenate(parts) for name, parts in rows.items()}
+
+
+def between(world, a, b, fractions):
+    """Configurations (n, D) on the straight edge from a to b."""
+    step = b - a
+    turns = np.where(np.asarray(world.is_continuous), np.round(step / (2 * np.pi)), 0)
+    return a + np.asarray(fractions)[:, None] * (step - 2 * np.pi * turns)
+
+
+def path_lengths(roadmap, goal):
+    """Length of the shortest path (N,) from every node to a goal, by a plain Dijkstra."""
+    lengths = np.full(len(roadmap.q), np.inf)
+    lengths[goal] = 0
+    queue = [(0.0, goal)]
+    while queue:
+        length, node = heapq.heappop(queue)
+        if length > lengths[node]:
+            continue
+        row = slice(*roadmap.lengths.indptr[node : node + 2])
+        for other, edge in zip(
+            roadmap.lengths.indices[row], roadmap.lengths.data[row], strict=True
+        ):
+            if length + edge < lengths[other]:
+                lengths[other] = length + edge
+                heapq.heappush(queue, (length + edge, other))
+    return lengths

@@ -1,8 +1,9 @@
-"""How fast configurations are checked, and how right: against C MuJoCo and plain loops.
+"""The ``nrp bench checks`` command: speed and errors of collision checks.
 
-Three opinions on the same random configurations: the batched check; a loop in numpy over the same
-spheres with exact distances to cells; and C MuJoCo with the robot's primitives and boxes. A
-collision that either exact one sees and the batched check does not is a missed one.
+Three methods check the same random configurations: the batched check of the planners; a loop in
+numpy over the same spheres, with exact distances to cells; and C MuJoCo, with the robot's geoms and
+the cells as boxes. The latter two are exact. A collision that one of them finds and the batched
+check does not is a missed collision.
 """
 
 import argparse
@@ -21,14 +22,14 @@ from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.timing import best_ms, machine
 from vrrt_jax.robots.kinematics import batch_link_poses
 
-BATCH = 1024
+BATCH = 1024  # configurations of a batched check
 
 
 class SphereLoop:
-    """One configuration at a time in numpy: the spheres' distances to all cells near them."""
+    """The exact check in numpy, a configuration at a time: spheres against the cells near them."""
 
     def __init__(self, robot: MobileRobot, grid: Grid):
-        """Keep the map with a solid rim, and the spheres."""
+        """Copy the map, with a solid rim around it, and the robot's spheres."""
         self.robot = robot
         self.grid = grid.flatten() if robot.planar else grid
         rim = 5
@@ -44,10 +45,12 @@ class SphereLoop:
             np.asarray(getattr(robot.chain, name), float)
             for name in ("constant", "cosine", "sine", "slide")
         ]
-        self.falls = ~np.isin(self.link, np.arange(robot.base_dim + 2)) & (not robot.planar)
+        # Spheres of the arm, which must not touch the floor or the base.
+        self.is_arm = ~np.isin(self.link, np.arange(robot.base_dim + 2)) & (not robot.planar)
 
     def is_free(self, q: np.ndarray) -> bool:
         """Whether ``q`` (D,) is free."""
+        # The spheres' centers, and the robot against itself.
         pose = self.poses(q)
         turned = pose[self.link]
         center = np.einsum("nij,nj->ni", turned[:, :3, :3], self.center) + turned[:, :3, 3]
@@ -57,7 +60,8 @@ class SphereLoop:
             return False
         if planar_boxes_overlap(self.robot, pose):
             return False
-        if (center[self.falls, 2] <= self.radius[self.falls]).any():
+        # The arm against the floor, all spheres against the cells, and the base.
+        if (center[self.is_arm, 2] <= self.radius[self.is_arm]).any():
             return False
         if any(self._hits(c, r) for c, r in zip(center, self.radius, strict=True)):
             return False
@@ -76,10 +80,11 @@ class SphereLoop:
         return np.array(poses)
 
     def _hits(self, center: np.ndarray, radius: float, top: float | None = None) -> bool:
-        """Whether a sphere, or an upright cylinder up to ``top``, touches a solid cell."""
+        """Whether a sphere, or an upright cylinder from the floor to ``top``, touches a cell."""
         flat = self.robot.planar or top is not None
         size, reach = self.grid.resolution, np.full(3, radius)
         place = (center - self.corner) / size
+        # The range of cells that can be near enough.
         low = np.floor(place - reach / size).astype(int)
         high = np.floor(place + reach / size).astype(int) + 1
         if top is not None:
@@ -89,17 +94,19 @@ class SphereLoop:
         elif flat:
             low[2], high[2] = 0, 1
         low, high = np.maximum(low, 0), np.minimum(high, self.solid.shape)
+        # The distance to each solid cell in it, along x and y alone where heights do not count.
         cells = np.argwhere(self.solid[tuple(map(slice, low, high))]) + low
         gap = np.maximum(np.maximum(cells - place, place - cells - 1), 0) * size
         return bool(((gap[:, : 2 if flat else 3] ** 2).sum(1) < radius**2).any())
 
     def _base_is_free(self, position: np.ndarray, center: np.ndarray) -> bool:
+        """Whether the round base at a position (3,) touches no cell and no sphere (n, 3)."""
         base = self.robot.footprint
         assert base is not None
         radius, height = float(base.radius), float(base.height)
         beside = np.linalg.norm(center[:, :2] - position[:2], axis=1) - radius
         gap = np.hypot(np.maximum(beside, 0), np.maximum(center[:, 2] - height, 0))
-        if (gap[self.falls] < self.radius[self.falls]).any():
+        if (gap[self.is_arm] < self.radius[self.is_arm]).any():
             return False
         return not self._hits(position, radius, top=height)
 
@@ -129,7 +136,18 @@ def planar_boxes_overlap(robot: MobileRobot, poses: np.ndarray) -> bool:
 
 
 def run(robot: MobileRobot, grid: Grid, num: int = 10_000, timed: int = 500) -> dict:
-    """Rates [1/s], and how the three opinions compare on random configurations of a map.
+    """Compare the three methods on random configurations of a map.
+
+    Args:
+        robot: the robot.
+        grid: the map.
+        num: configurations to compare.
+        timed: configurations to time the slow methods with.
+
+    Returns:
+        For each method ``checks_per_s`` [1/s] and ``free_share``; of the batched check the
+        ``missed`` collisions and the ``false_alarm_share_of_free``, for either exact method; and
+        ``links_us``, the microseconds that kinematics take for a configuration.
 
     Raises:
         ValueError: there is nothing to compare.

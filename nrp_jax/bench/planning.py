@@ -1,4 +1,4 @@
-"""How often do planners find a way across unseen homes within some expansions?"""
+"""The ``nrp bench plan`` command: how often planners solve long queries in unseen homes."""
 
 import argparse
 import dataclasses
@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from nrp_jax.homes.houses import CELLS
-from nrp_jax.learning.data import Settings, home_seed
 from nrp_jax.learning.difficulty import EXPANSIONS, MIN_GEODESIC, fair_house, long_queries
+from nrp_jax.learning.shards import DatasetSettings, home_seed
 from nrp_jax.planner import KINDS, PLANNERS, PlanResult, Status, plan
 from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.robots import MobileRobot, load_robot
@@ -23,21 +23,28 @@ from vrrt_jax.core.timing import machine
 
 @dataclasses.dataclass(frozen=True)
 class Home:
-    """A home with the queries asked in it."""
+    """A home with the queries to solve in it."""
 
     seed: int
     world: GridWorld
     scene: ExactScene
     starts: np.ndarray  # (n, D)
     goals: np.ndarray  # (n, D)
-    grid: Any
+    grid: Any  # planar for a planar robot
 
 
 def unseen_homes(robot: MobileRobot, homes: int, queries: int, seed: int) -> list[Home]:
-    """The test homes of a data set with this seed, with long queries of a home each."""
+    """Generate the test homes of a data set, which no network was trained in, and long queries.
+
+    Args:
+        robot: the robot.
+        homes: number of homes.
+        queries: number of queries of a home.
+        seed: of the data set.
+    """
     found = []
     for index in range(homes):
-        own = home_seed(Settings(task=robot.name, seed=seed), "test", index)
+        own = home_seed(DatasetSettings(task=robot.name, seed=seed), "test", index)
         house = fair_house(robot, own)
         grid = house.plan() if robot.planar else house.grid
         world = build_world(robot, grid)
@@ -57,11 +64,21 @@ def run(
     goal_bias: float,
     on_result: Callable[[PlanResult], Any] = lambda result: None,
 ) -> dict[str, Any]:
-    """Solve all queries by one method, each path checked with C MuJoCo.
+    """Solve all queries by one method; each path is checked with C MuJoCo.
+
+    Args:
+        robot: the robot.
+        homes: from :func:`unseen_homes`.
+        method: one of :data:`nrp_jax.planner.METHODS`.
+        sampler: for the methods that need one.
+        max_expansions: of a plan.
+        lanes: expansions at a time.
+        goal_bias: share of expansions that aim at the goal.
+        on_result: called with each plan.
 
     Returns:
         ``n``, ``success`` (share), ``median_search_s``, ``median_expansions`` and ``mean_cost_m``
-        (of those solved), ``not_verified`` (paths that C MuJoCo refuses).
+        (both of the solved queries), ``not_verified`` (number of paths that C MuJoCo refuses).
 
     Raises:
         KeyboardInterrupt: a search was interrupted.
@@ -86,6 +103,7 @@ def run(
                 )
             results.append(result)
             on_result(result)
+    # Costs and expansions count for solved queries alone.
     solved = [result for result in results if result.ok]
     return {
         "n": len(results),

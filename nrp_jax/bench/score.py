@@ -1,9 +1,6 @@
-"""How good are proposed waypoints? Their optimality score on homes that no model has seen.
+"""The ``nrp score`` command: optimality scores of samplers on homes that no network has seen.
 
-The score of a waypoint is the length of the expert's shortest path from start to goal over that of
-the shortest path through the waypoint (Lu et al. 2024, Table II); 0 if the straight edge to it is
-blocked, or no way leads on from it. From the waypoint all edges into the roadmap are tried, of
-which the roadmap itself has a share only: what so gets shorter than the optimum scores 1.
+:mod:`nrp_jax.bench.optimality` says what the score is.
 """
 
 import argparse
@@ -19,102 +16,29 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import sparse
-from scipy.sparse import csgraph
 
 from nrp_jax import samplers
+from nrp_jax.bench.optimality import make_queries, optimality
 from nrp_jax.homes.grid import Grid, load_map
-from nrp_jax.learning.data import VERSION, home_seed, load_dataset
-from nrp_jax.learning.expert import Extents, Roadmap, build_roadmap, check_edges, make_rows
+from nrp_jax.learning.data import load_dataset
 from nrp_jax.learning.models import KINDS, TASKS
+from nrp_jax.learning.roadmap import Roadmap, build_roadmap, load_roadmap
+from nrp_jax.learning.shards import VERSION, home_seed
 from nrp_jax.scene.robots import MobileRobot, load_robot
-from nrp_jax.scene.world import GridWorld, batch_is_free, build_world
-from vrrt_jax.core.files import replacing
+from nrp_jax.scene.world import GridWorld, build_world
 from vrrt_jax.core.timing import machine
 
-ROUND = 256  # edges from a waypoint into the roadmap that are checked before the next are looked at
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Queries:
-    """Starts and goals among the nodes of a roadmap, and how far the nodes are from the goals."""
-
-    start: np.ndarray  # (n,) indices of nodes
-    goal: np.ndarray  # (n,) indices into ``goals``
-    goals: np.ndarray  # (G,) indices of nodes
-    cost: np.ndarray  # (G, N) lengths of the shortest paths
-
-
-def make_queries(
-    world: GridWorld, robot: MobileRobot, roadmap: Roadmap, num: int, seed: int
-) -> Queries:
-    """Queries as the data sets have them."""
-    rng = np.random.default_rng(seed)
-    rows = make_rows(world, robot, roadmap, rng, num, 1)
-    node = {q.tobytes(): index for index, q in enumerate(roadmap.q)}
-    goals, goal = np.unique([node[q.tobytes()] for q in rows.q_goal], return_inverse=True)
-    return Queries(
-        start=np.array([node[q.tobytes()] for q in rows.q_start]),
-        goal=goal,
-        goals=goals,
-        cost=csgraph.dijkstra(roadmap.lengths, indices=goals),
-    )
-
-
-def optimality(
-    world: GridWorld, robot: MobileRobot, roadmap: Roadmap, queries: Queries, waypoint: np.ndarray
-) -> np.ndarray:
-    """Scores (n,), 0 to 1, of a waypoint (n, D) for each query."""
-    num = len(waypoint)
-    q = np.concatenate([roadmap.q, waypoint]).astype(np.float32)
-    own = len(roadmap.q) + np.arange(num)
-    first, free = check_edges(world, q, np.stack([queries.start, own], axis=1))
-    free &= np.asarray(batch_is_free(world, waypoint))  # of edges the ends are not looked at
-    best = np.where(free, np.inf, 0.0)  # length on from the waypoint; 0 for what needs no search
-    extents = Extents(robot, q)
-    waiting = {}
-    for k in np.flatnonzero(free):
-        near = np.flatnonzero(extents.inside(own[k], slice(len(roadmap.q))))
-        total = _lengths(world, q, own[k], near) + queries.cost[queries.goal[k], near]
-        order = np.argsort(total)
-        waiting[int(k)] = (near[order], total[order])
-    while waiting:
-        heads = {k: (near[:ROUND], total[:ROUND]) for k, (near, total) in waiting.items()}
-        pairs = [np.stack([np.full(len(n), own[k]), n], 1) for k, (n, _) in heads.items()]
-        _, ok = check_edges(world, q, np.concatenate(pairs).astype(np.int32))
-        ok = np.split(ok, np.cumsum([len(pair) for pair in pairs])[:-1])
-        for (k, (near, total)), passed in zip(heads.items(), ok, strict=True):
-            if passed.any():
-                best[k] = total[np.argmax(passed)]  # they come in order
-            rest = tuple(column[ROUND:] for column in waiting[k])
-            if passed.any() or len(near) < ROUND or len(rest[0]) == 0:
-                del waiting[k]
-            else:
-                waiting[k] = rest
-    optimum = queries.cost[queries.goal, queries.start]
-    score = optimum / np.maximum(first + best, 1e-9)
-    return np.where(free, np.minimum(score, 1.0), 0.0)
-
-
-def _lengths(world: GridWorld, q: np.ndarray, own: int, near: np.ndarray) -> np.ndarray:
-    """Lengths (m,) of the edges from one configuration to others, in blocks of one size."""
-    size = -(-len(near) // 1024) * 1024
-    index = np.resize(near, size) if len(near) else np.zeros(0, int)
-    parts = [_block(world, q[own], q[part]) for part in index.reshape(-1, 1024)]
-    return np.concatenate([np.asarray(part) for part in parts] or [np.zeros(0)])[: len(near)]
-
-
-@jax.jit
-def _block(world: GridWorld, q_from: jax.Array, q_to: jax.Array) -> jax.Array:
-    return world.length(world.edge(jnp.broadcast_to(q_from, q_to.shape), q_to))
+LANES = 32  # waypoints proposed at a time, as a planner asks for them
+_REPEATS = 32  # of a timing
 
 
 def propose_all(
     sampler: samplers.Sampler, world: GridWorld, q_from: np.ndarray, q_goal: np.ndarray, seed: int
 ) -> np.ndarray:
-    """Waypoints (n, D), 32 at a time as a planner asks for them."""
-    num, lanes = len(q_from), 32
-    rows = np.resize(np.arange(num), (-(-num // lanes), lanes))
+    """Waypoints (n, D) from starts to goals (n, D), in batches as a planner asks for them."""
+    num = len(q_from)
+    # The last batch is filled up with the first queries, so that all have one shape.
+    rows = np.resize(np.arange(num), (-(-num // LANES), LANES))
     key = jax.random.key(seed)
     made = [
         np.asarray(
@@ -126,14 +50,14 @@ def propose_all(
 
 
 def milliseconds_per_32(sampler: samplers.Sampler, world: GridWorld, q: np.ndarray) -> float:
-    """Median time of 32 proposals between configurations (n, D), compiled before [ms]."""
-    q_from, q_goal = (jnp.asarray(np.resize(part, (32, q.shape[1]))) for part in (q, q[::-1]))
+    """Median time of 32 proposals between configurations (n, D), without compilation [ms]."""
+    q_from, q_goal = (jnp.asarray(np.resize(part, (LANES, q.shape[1]))) for part in (q, q[::-1]))
     times = []
-    for k in range(32):
+    for k in range(_REPEATS):
         started = time.perf_counter()
         jax.block_until_ready(samplers.propose(sampler, world, q_from, q_goal, jax.random.key(k)))
         times.append(time.perf_counter() - started)
-    return 1e3 * float(np.median(times[2:]))
+    return 1e3 * float(np.median(times[2:]))  # the first calls compile
 
 
 def score_homes(
@@ -157,11 +81,12 @@ def score_homes(
         queries: of each home.
         nodes: of each roadmap.
         cache: folder where roadmaps are kept between runs.
-        progress: called with a line for each home.
+        progress: called with a line of text for each home.
 
     Returns:
-        For each sampler ``optimality_score`` (mean), ``reachable`` (share of waypoints with a free
-        edge from the start and a way on), ``by_home`` (mean scores) and ``ms_per_32``.
+        For each sampler ``optimality_score`` (mean of all queries), ``reachable`` (share of
+        waypoints with a score above 0), ``by_home`` (mean scores), ``ms_per_32`` (time of 32
+        proposals [ms]) and ``queries`` (their number).
     """
     scores: dict[str, list[np.ndarray]] = {name: [] for name in tested}
     times: dict[str, list[float]] = {name: [] for name in tested}
@@ -170,6 +95,7 @@ def score_homes(
         roadmap = _roadmap(world, robot, grid, seed, nodes, cache)
         asked = make_queries(world, robot, roadmap, queries, seed)
         q_from, q_goal = roadmap.q[asked.start], roadmap.q[asked.goals[asked.goal]]
+        # All samplers get the same queries.
         for name, sampler in tested.items():
             waypoint = propose_all(sampler, world, q_from, q_goal, seed)
             scores[name].append(optimality(world, robot, roadmap, asked, waypoint))
@@ -192,28 +118,18 @@ def score_homes(
 def _roadmap(
     world: GridWorld, robot: MobileRobot, grid: Grid, seed: int, nodes: int, cache: Path | None
 ) -> Roadmap:
-    """A home's roadmap, from the cache if it is there."""
+    """A home's roadmap, from the cache if it is there; its file is named by what it was made of."""
     if cache is None:
         return build_roadmap(world, robot, jax.random.key(seed), nodes)
     content = np.packbits(grid.occupied).tobytes() + str(grid.origin).encode()
     which = hashlib.sha256(content).hexdigest()[:12]
     file = cache / f"roadmap_v{VERSION}_{robot.name}_{which}_{seed}_{nodes}.npz"
-    if not file.exists():
-        roadmap = build_roadmap(world, robot, jax.random.key(seed), nodes)
-        cache.mkdir(parents=True, exist_ok=True)
-        with replacing(file) as handle:
-            graph = {name: getattr(roadmap.lengths, name) for name in ("data", "indices", "indptr")}
-            rest = {"colliding": roadmap.colliding, "checked": roadmap.checked}
-            np.savez(handle, q=roadmap.q, **graph, **rest)
-        return roadmap
-    with np.load(file) as saved:
-        parts = (saved["data"], saved["indices"], saved["indptr"])
-        return Roadmap(
-            q=saved["q"],
-            lengths=sparse.csr_matrix(parts, shape=(len(saved["q"]),) * 2),
-            colliding=saved["colliding"],
-            checked=int(saved["checked"]),
-        )
+    if file.exists():
+        return load_roadmap(file)
+    roadmap = build_roadmap(world, robot, jax.random.key(seed), nodes)
+    cache.mkdir(parents=True, exist_ok=True)
+    roadmap.save(file)
+    return roadmap
 
 
 def add_arguments(subparsers: Any) -> None:
@@ -240,7 +156,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
         if value < least:
             raise ValueError(f"{name} is {value}; expected at least {least}")
     task, robot = arguments.task, load_robot(arguments.task)
-    checked = {"checked": 1} if arguments.unchecked else {}
+    checked = {"num_edge_checked": 1} if arguments.unchecked else {}
     tested = {
         kind: samplers.load_sampler(task, kind, getattr(arguments, kind), **checked)
         for kind in KINDS
@@ -251,7 +167,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
             f"the data set is of task '{dataset.settings.task}'; expected '{task}': give another "
             "--data, or the other --task"
         )
-    maps = {} if arguments.maps is None else _maps(Path(arguments.maps), robot, tested)
+    maps = {} if arguments.maps is None else _load_maps(Path(arguments.maps), robot, tested)
     settings = {
         "queries": arguments.queries,
         "nodes": arguments.nodes,
@@ -278,10 +194,16 @@ def _run_command(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _maps(
+def _load_maps(
     folder: Path, robot: MobileRobot, tested: Mapping[str, samplers.Sampler]
 ) -> dict[str, Grid]:
-    """The maps in a folder that robot and samplers can use, by path, with x and y from 0."""
+    """Load the maps in a folder that fit the robot and the samplers, by path.
+
+    Their x and y begin at 0 then. Maps that do not fit are named on the standard error.
+
+    Raises:
+        ValueError: no map fits.
+    """
     kinds = (".npz", ".yaml", ".yml", ".xml")
     grids = {}
     for file in sorted(file for file in folder.rglob("*") if file.suffix in kinds):

@@ -1,6 +1,6 @@
 """Floor plans: rooms by recursive splits, corridors, corners cut off, and doors.
 
-Everything is in cells of 0.1 m.
+All lengths and coordinates are in cells of 0.1 m.
 """
 
 import dataclasses
@@ -8,14 +8,14 @@ import dataclasses
 import numpy as np
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-WALL = -1
+WALL = -1  # label of walls and of what lies outside
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Room:
-    """A room's rectangle [x0, x1) x [y0, y1) in cells, walls outside, and its use."""
+    """The rectangle [x0, x1) x [y0, y1) of a room in cells, without its walls, and its use."""
 
-    kind: str
+    kind: str  # a key of :data:`nrp_jax.homes.furniture.ROOMS`, or "door"
     x0: int
     y0: int
     x1: int
@@ -29,7 +29,7 @@ class Room:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FloorPlan:
-    """Rooms, the openings between them, and what every cell belongs to."""
+    """Rooms, the openings between them, and the room of every cell."""
 
     rooms: tuple[Room, ...]
     doors: tuple[Room, ...]  # openings in walls, as rectangles
@@ -68,7 +68,7 @@ def make_floor_plan(
 
 
 def _split(rng: np.random.Generator, room: Room, shortest: int = 18) -> list[Room]:
-    """Two rooms with a wall between them, across the longer side."""
+    """Split a room by a wall across its longer side; the room itself if it is too small."""
     w, h = room.x1 - room.x0, room.y1 - room.y0
     across_x = w * rng.uniform(0.8, 1.25) > h
     length = w if across_x else h
@@ -84,7 +84,7 @@ def _split(rng: np.random.Generator, room: Room, shortest: int = 18) -> list[Roo
 
 
 def _split_off_corridor(rng: np.random.Generator, whole: Room) -> tuple[list[Room], list[Room]]:
-    """A corridor from wall to wall, with a part of the home on either side."""
+    """Split a home by a corridor from wall to wall: the parts on either side, and the corridor."""
     width = int(rng.integers(9, 16))
     along_x = rng.random() < 0.5
     length = whole.y1 - whole.y0 if along_x else whole.x1 - whole.x0
@@ -100,7 +100,7 @@ def _split_off_corridor(rng: np.random.Generator, whole: Room) -> tuple[list[Roo
 
 
 def _name(rng: np.random.Generator, rooms: list[Room]) -> list[Room]:
-    """The largest room is for living, the smallest is the bath, the others as they come."""
+    """Give each room a use: the largest is the living room, the smallest is the bath."""
     rooms = sorted(rooms, key=lambda room: -room.area)
     others = ["kitchen", "bedroom", "bedroom", "office", "bedroom", "office"]
     kinds = ["living", *others[: len(rooms) - 2], "bath"]
@@ -112,19 +112,20 @@ def _name(rng: np.random.Generator, rooms: list[Room]) -> list[Room]:
 
 
 def _cut_corners(rng: np.random.Generator, labels: np.ndarray, whole: Room) -> None:
-    """Up to three corners of the home lie outside."""
+    """Cut off up to three corners of the home; they lie outside then."""
     for corner in rng.permutation(4)[: rng.integers(0, 4)]:
         w, h = rng.integers(8, 22, 2)
         x = slice(whole.x0, whole.x0 + w) if corner < 2 else slice(whole.x1 - w, whole.x1)
         y = slice(whole.y0, whole.y0 + h) if corner % 2 else slice(whole.y1 - h, whole.y1)
-        if len(np.unique(labels[x, y])) == 1:  # never a piece of two rooms
+        if len(np.unique(labels[x, y])) == 1:  # a corner belongs to one room
             labels[x, y] = WALL
 
 
 def _doors(
     rng: np.random.Generator, rooms: tuple[Room, ...], labels: np.ndarray
 ) -> tuple[Room, ...]:
-    """Doors along a random spanning tree of the rooms, and up to two more."""
+    """Open doors along a random spanning tree of the rooms, and up to two more."""
+    # All doors that are possible; those to a corridor or the living room are preferred.
     n = len(rooms)
     doors = {}
     weight = np.zeros((n, n))
@@ -134,6 +135,7 @@ def _doors(
             if door is not None:
                 hub = {"corridor", "living"} & {rooms[a].kind, rooms[b].kind}
                 doors[a, b], weight[a, b] = door, rng.uniform(0.1, 1) + (0 if hub else 1)
+    # The tree connects all rooms, and the spare doors make loops.
     tree = minimum_spanning_tree(weight).tocoo()
     chosen = list(zip(tree.row.tolist(), tree.col.tolist(), strict=True))
     spare = [pair for pair in doors if pair not in chosen]
@@ -146,7 +148,7 @@ def _doors(
 
 
 def _door(rng: np.random.Generator, a: Room, b: Room, labels: np.ndarray) -> Room | None:
-    """An opening in the wall between two rooms, if they share one that is long enough."""
+    """Draw an opening in the wall between two rooms; None if they share no wall long enough."""
     if b.x1 < a.x0 or b.y1 < a.y0:
         a, b = b, a
     beside_x = 1 <= b.x0 - a.x1 <= 2
@@ -158,10 +160,12 @@ def _door(rng: np.random.Generator, a: Room, b: Room, labels: np.ndarray) -> Roo
     else:
         low, high, before, after = max(a.x0, b.x0), min(a.x1, b.x1), a.y1, b.y0
         passable = (labels[:, before - 1] >= 0) & (labels[:, after] >= 0)
+    # The part of the wall that has a room on both sides.
     where = low + np.flatnonzero(passable[low:high])
     if len(where) < 12:
         return None
     low, high = int(where[0]), int(where[-1]) + 1
+    # Most doors are narrow; some are wide, and a few nearly as wide as the wall.
     style, narrow = rng.random(), "bath" in (a.kind, b.kind)
     width = int(rng.integers(8, 11) if style < 0.7 or narrow else rng.integers(10, 13))
     if style > 0.85 and not narrow:
@@ -169,6 +173,7 @@ def _door(rng: np.random.Generator, a: Room, b: Room, labels: np.ndarray) -> Roo
         if style > 0.93:
             width = high - low - 4
     width = min(width, high - low - 2)
+    # Doors are near the end of the wall more often than not.
     last = high - width - 1
     near_end = [low + 1 + int(rng.integers(0, 3)), last - int(rng.integers(0, 3))]
     start = int(rng.choice(near_end) if rng.random() < 0.6 else rng.integers(low + 1, last + 1))

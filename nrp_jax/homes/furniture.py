@@ -1,8 +1,8 @@
 """Furniture of real sizes as small blocks of voxels, for :mod:`nrp_jax.homes.houses`.
 
-Every maker takes a random generator and returns a volume (w, d, 20) of occupied cells of 0.1 m,
-standing on the floor, with its back, the side that belongs against a wall, at index 0 of the second
-axis. Sizes are medians of furniture in homes, varied by a tenth.
+Every maker takes a random generator and returns a volume (w, d, 20) of occupied cells of 0.1 m that
+stands on the floor. The back, which is the side that belongs against a wall, is at index 0 of the
+second axis. Sizes are medians of furniture in homes, varied by a tenth.
 """
 
 from collections.abc import Callable
@@ -14,6 +14,7 @@ Maker = Callable[[np.random.Generator], np.ndarray]
 
 
 def _cells(rng: np.random.Generator, *sizes: float) -> list[int]:
+    """Sizes [m], varied by a tenth, in cells."""
     return [max(1, round(10 * size * rng.uniform(0.9, 1.1))) for size in sizes]
 
 

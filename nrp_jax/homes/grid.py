@@ -8,10 +8,10 @@ import numpy as np
 import yaml
 from PIL import Image, UnidentifiedImageError
 
-RESOLUTION = 0.1  # [m]
-HEIGHT = 2.0  # of a home [m]
+RESOLUTION = 0.1  # side of the cells that planners and networks expect [m]
+HEIGHT = 2.0  # of the maps [m]; homes end there
 _UNKNOWN = 0.196  # just below the occupancy of ROS's gray 205, which stands for unknown
-_PROBE = "cell"
+_PROBE = "cell"  # name of the box that stands for a cell in MuJoCo
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -150,6 +150,7 @@ def coarsened(grid: Grid, resolution: float = RESOLUTION) -> Grid:
             f"the map's cells are {grid.resolution} m, but planning needs {resolution} m or less: "
             "scan or draw it finer"
         )
+    # Axis by axis: a small cell makes the large cells solid that hold its first and last edge.
     ratio = grid.resolution / resolution
     axes = 2 if grid.planar else 3
     occupied = grid.occupied
@@ -160,6 +161,7 @@ def coarsened(grid: Grid, resolution: float = RESOLUTION) -> Grid:
         edges = np.arange(cells.shape[0] + 1) * ratio
         np.logical_or.at(coarse, np.floor(edges[:-1] + 1e-6).astype(int), cells)
         np.logical_or.at(coarse, np.ceil(edges[1:] - 1e-6).astype(int) - 1, cells)
+        # The last large cell may lie partly beside the map, where all is solid.
         if axis < 2 and size < len(coarse) - 1e-6:
             coarse[-1] = True
         occupied = np.moveaxis(coarse, 0, axis)
@@ -203,6 +205,7 @@ def _read_ros(path: Path) -> Grid:
         raise ValueError(
             f"its image has pixels of kind '{image.mode}'; expected 8 bits a pixel: convert it"
         )
+    # Gray values are occupancies, unless negated: dark is solid. Transparent pixels are unknown.
     if not about.get("negate", 0):
         gray = 1 - gray
     clear = np.asarray(image.convert("RGBA").getchannel("A")) < 255
@@ -222,6 +225,7 @@ def _read_mjcf(path: Path) -> Grid:
         model = spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo cannot compile it: {error}") from error
+    # The geoms that can be collided with, at their places.
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     probe = model.geom(_PROBE).id
@@ -233,12 +237,14 @@ def _read_mjcf(path: Path) -> Grid:
     )
     if not len(geoms):
         raise ValueError("the scene has no geom to collide with but planes")
+    # A grid around all of them, in cells of 0.1 m.
     boxes = [_bounds(model, data, int(g)) for g in geoms]
     low = np.append(np.min([b[0] for b in boxes], axis=0)[:2], 0.0)
     high = np.append(np.max([b[1] for b in boxes], axis=0)[:2], HEIGHT)
     first = np.floor(low / RESOLUTION + 1e-6).astype(int)
     shape = np.ceil(high / RESOLUTION - 1e-6).astype(int) - first
     occupied = np.zeros(shape, bool)
+    # Move the box to each cell near a geom: does it touch the geom?
     for geom, (lower, upper) in zip(geoms, boxes, strict=True):
         start = np.clip(np.floor(lower / RESOLUTION + 1e-6).astype(int) - first, 0, shape)
         stop = np.clip(np.ceil(upper / RESOLUTION - 1e-6).astype(int) - first, 0, shape)

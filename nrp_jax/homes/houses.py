@@ -1,13 +1,11 @@
 """Homes for training: random floor plans with furniture, as occupancy grids.
 
-They stand in for the scanned homes of the Neural Randomized Planner (Lu et al. 2024): rooms by
-recursive splits, corridors, doors, furniture of real sizes and the rags of a scan. Everything is in
-cells of 0.1 m; the same seed gives the same home.
+They stand in for the scanned homes of the Neural Randomized Planner (Lu et al. 2024). Rooms come
+from recursive splits; corridors, doors and furniture of real sizes follow; at last the errors that
+a scanner makes. Everything is in cells of 0.1 m. The same seed gives the same home.
 """
 
-import argparse
 import dataclasses
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -17,33 +15,33 @@ from nrp_jax.homes.floor_plan import WALL, FloorPlan, Room, make_floor_plan
 from nrp_jax.homes.furniture import FREE_STANDING, HEIGHT, MAKERS, ROOMS
 from nrp_jax.homes.grid import Grid
 
-VERSION = 1  # of the generator; a data set remembers it
-CELLS = {"snake": 100, "fetch": 150}  # sides of the grids
-BODY = {"snake": 1.0, "fetch": 1.5}  # height that a robot's base and trunk meet [m]
-SPREAD = 4  # cells that placing furniture keeps free around the base
-ERODE = 0.3  # [m] around the base where the free space must be connected
+VERSION = 1  # of the generator; data sets record it
+CELLS = {"snake": 100, "fetch": 150}  # cells of a side of the grids
+BODY = {"snake": 1.0, "fetch": 1.5}  # height of a robot's base and trunk [m]
+SPREAD = 4  # radius of the base, in cells, that furniture keeps free
+ERODE = 0.3  # radius of the base for which the free floor must be connected [m]
 MIN_ROOMS = 4
 _ATTEMPTS = 100
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class House:
-    """A home, and what it was made of."""
+    """A home, and the parts it was made of."""
 
     seed: int
-    kind: str  # "snake" or "fetch": the robot it is made for
+    kind: str  # "snake" or "fetch", the robot that it is made for
     grid: Grid  # occupancy (X, Y, 20)
     rooms: tuple[Room, ...]
     doors: tuple[Room, ...]  # openings in walls, as rectangles
     walls: np.ndarray  # (X, Y) bool
 
     def plan(self) -> Grid:
-        """The home seen by a robot that stays in the plane: (X, Y, 1), below 1 m."""
+        """The map (X, Y, 1) that a planar robot meets: all cells below 1 m."""
         return self.grid.flatten(0.0, 1.0)
 
 
 def generate_house(seed: int, kind: str = "snake", clutter: float = 1.0, variant: int = 0) -> House:
-    """Make a home.
+    """Generate a home.
 
     Args:
         seed: the same seed, kind, clutter and variant give the same home.
@@ -53,6 +51,7 @@ def generate_house(seed: int, kind: str = "snake", clutter: float = 1.0, variant
 
     Raises:
         ValueError: the kind is unknown.
+        RuntimeError: no attempt with this seed gives a home.
     """
     if kind not in CELLS:
         raise ValueError(f"unknown kind of home '{kind}'; have: {', '.join(CELLS)}")
@@ -67,36 +66,37 @@ def generate_house(seed: int, kind: str = "snake", clutter: float = 1.0, variant
 
 
 def is_connected(grid: Grid, kind: str) -> bool:
-    """Whether the floor where a robot's base has 0.3 m of air around it is one piece."""
+    """Whether a robot's base, with 0.3 m of free space around it, can reach all of the floor."""
     return _pieces(floor(grid, kind))[1] == 1
 
 
 def floor(grid: Grid, kind: str) -> np.ndarray:
-    """Cells (X, Y) whose centers have 0.3 m of air around them at the heights of a robot's body."""
+    """Cells (X, Y) whose centers have 0.3 m of free space around them, as high as the robot."""
     plan = grid.flatten(0.0, BODY[kind]).occupied[:, :, 0]
     # Distances run between centers of cells: half a cell of each belongs to the obstacle.
     return _distance(~plan) * grid.resolution > ERODE + 0.5 * grid.resolution
 
 
 def _pieces(mask: np.ndarray) -> tuple[np.ndarray, int]:
-    """Connected pieces as labels of the cells, and how many there are."""
+    """Labels (X, Y) of the connected parts of a mask, 0 outside, and the number of parts."""
     labels, count = cast(Any, ndimage.label(mask))
     return labels, int(count)
 
 
 def _distance(mask: np.ndarray) -> np.ndarray:
-    """Distance of every cell to the nearest one outside [cells]."""
+    """Distance (X, Y) of every cell to the nearest cell outside the mask [cells]."""
     return cast(np.ndarray, ndimage.distance_transform_edt(mask))
 
 
 def _attempt(rng: np.random.Generator, seed: int, kind: str, clutter: float) -> House | None:
+    """Try to make a home; None if the floor is not connected even without furniture."""
     side = CELLS[kind]
     width, depth = (side, side) if kind == "snake" else rng.integers(120, side + 1, 2).tolist()
     num_rooms = int(rng.integers(4, 7) if kind == "snake" else rng.integers(5, 9))
     plan = make_floor_plan(rng, side, width, depth, num_rooms)
     draft = _Draft(plan, round(10 * BODY[kind]))
     if _pieces(~draft.blocked)[1] != 1:
-        return None  # then nothing could be placed
+        return None
     for door in plan.doors:
         draft.keep_clear(door)
         if max(door.x1 - door.x0, door.y1 - door.y0) <= 12 and rng.random() < 0.35:
@@ -114,7 +114,7 @@ def _attempt(rng: np.random.Generator, seed: int, kind: str, clutter: float) -> 
 
 
 def _hang_leaf(rng: np.random.Generator, draft: "_Draft", door: Room) -> None:
-    """An open door leaf at right angles to the wall, on one of its four places."""
+    """Add an open door leaf at right angles to the wall, at one of four places, if it fits."""
     along_y = door.y1 - door.y0 > door.x1 - door.x0
     length = max(door.x1 - door.x0, door.y1 - door.y0)
     end, side = rng.integers(0, 2, 2)
@@ -127,35 +127,48 @@ def _hang_leaf(rng: np.random.Generator, draft: "_Draft", door: Room) -> None:
 
 
 class _Draft:
-    """A home on its way: what stands where, what must stay clear, and where the base can go."""
+    """An unfinished home: what stands where, what must stay clear, and where the base can go."""
 
     def __init__(self, plan: FloorPlan, body: int):
+        """Begin with the walls of a plan; ``body`` is the height of the robot's body in cells."""
         self.walls = plan.labels == WALL
         self.occupied = np.repeat(self.walls[:, :, None], HEIGHT, axis=2)
-        self.taken = self.walls.copy()  # at any height
-        self.clear = np.zeros_like(self.walls)
+        self.taken = self.walls.copy()  # (X, Y) cells where something stands at any height
+        self.clear = np.zeros_like(self.walls)  # (X, Y) cells before doors
         self.body = body
         i, j = np.ogrid[-SPREAD : SPREAD + 1, -SPREAD : SPREAD + 1]
         self.disc = i**2 + j**2 < (SPREAD + 0.5) ** 2
-        # Where the center of the base cannot be; a little less near walls, so that doors pass.
+        # Cells where the center of the base cannot be; a bit fewer near walls, so that doors pass.
         self.blocked = _distance(~self.walls) <= SPREAD - 0.5
 
     def keep_clear(self, door: Room, reach: int = 6) -> None:
-        """No furniture in a door nor right before it."""
+        """Keep furniture out of a door and ``reach`` cells before and behind it."""
         if door.y1 - door.y0 > door.x1 - door.x0:
             self.clear[door.x0 - reach : door.x1 + reach, door.y0 : door.y1] = True
         else:
             self.clear[door.x0 : door.x1, door.y0 - reach : door.y1 + reach] = True
 
     def place(self, volume: np.ndarray, x: int, y: int, clear: bool = True) -> bool:
-        """Put a volume down with its corner at (x, y), if it fits and cuts nothing off."""
+        """Put a piece of furniture at a place, if it fits and leaves the floor connected.
+
+        Args:
+            volume: (w, d, 20) its occupied cells.
+            x: first cell along x.
+            y: first cell along y.
+            clear: keep out of the cells before doors.
+
+        Returns:
+            Whether it was placed.
+        """
         w, d = volume.shape[:2]
         if x < 1 or y < 1 or x + w >= len(self.taken) or y + d >= len(self.taken):
             return False
+        # It may neither overlap with anything nor stand before a door.
         here = (slice(x, x + w), slice(y, y + d))
         footprint = volume.any(2)
         if (self.taken[here] & footprint).any() or (clear and (self.clear[here] & footprint).any()):
             return False
+        # Where does it block the base? Undo it if the floor falls apart.
         base = np.pad(volume[:, :, : self.body].any(2), SPREAD)
         grown = cast(np.ndarray, ndimage.binary_dilation(base, self.disc))
         i, j = max(x - SPREAD, 0), max(y - SPREAD, 0)
@@ -172,7 +185,7 @@ class _Draft:
 
 
 def _furnish(rng: np.random.Generator, draft: _Draft, room: Room, clutter: float) -> None:
-    """What the room needs, then fillers, things on the walls and clutter."""
+    """Place what a room of this kind has, then fillers, clutter and things on the walls."""
     needs, fillers = ROOMS[room.kind]
     for name in needs:
         _try(rng, draft, room, name, tries=12)
@@ -187,6 +200,7 @@ def _furnish(rng: np.random.Generator, draft: _Draft, room: Room, clutter: float
 
 
 def _try(rng: np.random.Generator, draft: _Draft, room: Room, name: str, tries: int) -> bool:
+    """Try some random places in a room for a piece of furniture; whether one of them fits."""
     for _ in range(tries):
         turn = int(rng.integers(0, 4))
         volume = np.rot90(MAKERS[name](rng), turn, (0, 1))
@@ -196,6 +210,7 @@ def _try(rng: np.random.Generator, draft: _Draft, room: Room, name: str, tries: 
             continue
         x = room.x0 + int(rng.integers(0, space[0] + 1))
         y = room.y0 + int(rng.integers(0, space[1] + 1))
+        # Against a wall, with its back to it.
         if name not in FREE_STANDING or rng.random() < 0.3:
             if turn % 2 == 0:  # turned by 0 or 2, the back is at the low or the high end of y
                 y = room.y0 if turn == 0 else room.y1 - d
@@ -207,11 +222,11 @@ def _try(rng: np.random.Generator, draft: _Draft, room: Room, name: str, tries: 
 
 
 def _scan(rng: np.random.Generator, draft: _Draft, kind: str) -> np.ndarray:
-    """What a scanner would make of it: fat, ragged edges, blobs on walls, specks; (X, Y, 20)."""
+    """The map (X, Y, 20) that a scanner would make: ragged edges, blobs on walls, specks."""
     occupied = draft.occupied.copy()
     plan = draft.walls.shape
     beside = ndimage.binary_dilation(occupied, np.ones((3, 3, 1), bool)) & ~occupied
-    # Rags hang together over half a meter of height.
+    # Ragged cells beside solid ones, alike over half a meter of height.
     ragged = np.repeat(rng.random((*plan, 4)) < 0.13, HEIGHT // 4, axis=2)
     blobs = ndimage.binary_dilation(rng.random(plan) < 0.002, iterations=2)
     near_wall = cast(np.ndarray, ndimage.binary_dilation(draft.walls, iterations=2))
@@ -219,7 +234,7 @@ def _scan(rng: np.random.Generator, draft: _Draft, kind: str) -> np.ndarray:
     noise = (beside & ragged) | (blobs & near_wall | specks)[:, :, None]
     occupied |= noise & ~draft.clear[:, :, None]
     occupied[[0, -1]] = occupied[:, [0, -1]] = True
-    # Places that the base could stand in but never reach are filled.
+    # Fill places where the base could stand but which it cannot reach.
     pieces, count = _pieces(floor(Grid(occupied=occupied), kind))
     if count > 1:
         sizes = np.bincount(pieces.ravel())[1:]
@@ -227,64 +242,3 @@ def _scan(rng: np.random.Generator, draft: _Draft, kind: str) -> np.ndarray:
         if lost.sum() < 0.05 * sizes.max():
             occupied[lost & ~draft.clear, :8] = True
     return occupied
-
-
-def save_figure(houses: list[House], path: str | Path) -> None:
-    """Draw homes side by side: walls dark, furniture browner with its height, overhangs bluish."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    columns = min(5, len(houses))
-    rows = -(-len(houses) // columns)
-    figure, axes = pyplot.subplots(rows, columns, figsize=(3.2 * columns, 3.3 * rows), dpi=110)
-    axes = np.ravel(axes)
-    for axis in axes:
-        axis.axis("off")
-    for axis, house in zip(axes, houses, strict=False):
-        _draw(axis, house)
-    figure.tight_layout(pad=0.4)
-    figure.savefig(path)
-    pyplot.close(figure)
-
-
-def _draw(axis, house: House) -> None:
-    from matplotlib import colormaps
-
-    occupied = house.grid.occupied
-    top = HEIGHT - occupied[:, :, ::-1].argmax(2)
-    image = np.ones((*house.walls.shape, 3))
-    standing = occupied.any(2)
-    image[standing] = colormaps["YlOrBr"](0.25 + 0.6 * top / HEIGHT)[..., :3][standing]
-    over = standing & ~occupied[:, :, 0]
-    image[over] = 0.45 * image[over] + 0.55 * np.array([0.55, 0.75, 0.95])
-    image[house.walls] = 0.2
-    size = 0.1 * occupied.shape[0]
-    axis.imshow(image.swapaxes(0, 1), origin="lower", extent=(0, size, 0, size))
-    for room in house.rooms:
-        axis.text(
-            0.05 * (room.x0 + room.x1), 0.05 * (room.y0 + room.y1), room.kind,
-            fontsize=6, color="tab:blue", ha="center", va="center",
-        )  # fmt: skip
-    axis.set_title(f"seed {house.seed}", fontsize=7, pad=2)
-
-
-def add_arguments(subparsers) -> None:
-    """Add the ``homes`` command to a command line."""
-    parser = subparsers.add_parser("homes", help="draw random homes")
-    parser.set_defaults(run=_run)
-    parser.add_argument("--num", type=int, default=20, help="homes")
-    parser.add_argument("--seed", type=int, default=0, help="of the first; the others follow")
-    parser.add_argument("--task", default="snake", choices=tuple(CELLS), help="whose homes")
-    parser.add_argument("--out", required=True, help="a .png file")
-
-
-def _run(arguments: argparse.Namespace) -> int:
-    if arguments.num < 1:
-        raise ValueError(f"--num is {arguments.num}; expected at least 1")
-    seeds = range(arguments.seed, arguments.seed + arguments.num)
-    houses = [generate_house(seed, arguments.task) for seed in seeds]
-    save_figure(houses, arguments.out)
-    print(f"wrote {arguments.out}")
-    return 0

@@ -1,7 +1,9 @@
 """Rows of a data set as arrays on the device, and batches of them as the networks see them.
 
-Rows are grouped by query, so that a window is cut and encoded once for all its waypoints.
-Letters: ``Q`` queries, ``W`` waypoints of a query, ``H`` homes, ``n`` queries of a batch.
+Rows are grouped by query, so that the image around a start is cut out and encoded once for all
+waypoints of the query. Configurations and points are *local*: in a frame at the center of the
+image, with the map's axes. Letters: ``Q`` queries, ``W`` waypoints of a query, ``H`` homes, ``n``
+queries of a batch, ``D`` joints, ``F`` link frames, ``E`` features.
 """
 
 import functools
@@ -15,7 +17,7 @@ from nrp_jax.homes.grid import RESOLUTION, Grid
 from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning import features, local_map
 from nrp_jax.learning.data import Dataset
-from nrp_jax.learning.expert import POSITIVE
+from nrp_jax.learning.expert import GOOD_RATIO
 from nrp_jax.learning.models import ModelConfig
 from nrp_jax.scene.field import DistanceField, make_field
 from nrp_jax.scene.robots import MobileRobot, batch_link_features
@@ -24,33 +26,34 @@ from vrrt_jax.core.types import pytree
 
 @pytree
 class Examples:
-    """Training rows on the device."""
+    """Training rows on the device, in the frame of the map."""
 
     maps: jax.Array  # (H, X + 40, Y + 40, Z) float16, see :func:`surrounding_map`
     home: jax.Array  # (Q,) i32
-    q: jax.Array  # (Q, 2 + W, D) start, goal and waypoints in the world
-    points: jax.Array  # (Q, 2 + W, F, 3) their link frames [m]
+    q: jax.Array  # (Q, 2 + W, D) start, goal and waypoints
+    points: jax.Array  # (Q, 2 + W, F, 3) positions of their link frames [m]
     target: jax.Array  # (Q, W) how good each waypoint is, 0 to 1
-    weight: jax.Array  # (Q, W) of the row in the loss, 0 where a query has fewer waypoints
+    weight: jax.Array  # (Q, W) of each waypoint in the loss, 0 where a query has fewer waypoints
 
 
 @pytree
 class Batch:
     """What the networks see of n queries."""
 
-    image: jax.Array  # (n, X, Y, Z)
-    start: jax.Array  # (n, E)
-    goal: jax.Array  # (n, E')
-    waypoints: jax.Array  # (n, W, E'')
+    image: jax.Array  # (n, X, Y, Z) surroundings of the starts
+    start: jax.Array  # (n, E) features
+    goal: jax.Array  # (n, E') features
+    waypoints: jax.Array  # (n, W, E) features
     relation: jax.Array  # (n, W, R), see :func:`relations`
-    target: jax.Array  # (n, W)
-    weight: jax.Array  # (n, W)
+    target: jax.Array  # (n, W) how good each waypoint is, 0 to 1
+    weight: jax.Array  # (n, W) in the loss
 
 
 def surrounding_map(config: ModelConfig, field: DistanceField) -> jax.Array:
-    """A field's map as the images are cut from it: (X + 40, Y + 40, Z), bordered by solid cells.
+    """The map from which images are cut, (X + 40, Y + 40, Z), with a border of solid cells.
 
-    Distances to obstacles [m]; for the published models occupancies.
+    Cells hold the distance to the nearest obstacle [m], 0 if solid. For the published models they
+    hold 1 if solid and 0 if free.
     """
     distances = features.surroundings(field)
     half = local_map.SIDE // 2
@@ -59,10 +62,10 @@ def surrounding_map(config: ModelConfig, field: DistanceField) -> jax.Array:
     return jnp.where(distances > 0, 0.0, 1.0) if config.paper else distances
 
 
-def view(
+def local_image(
     config: ModelConfig, padded: jax.Array, q: jax.Array, resolution: jax.Array, origin: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """What a model sees from a start ``q`` (D,): an image, and the place of its middle.
+    """Cut out what a model sees from a start ``q`` (D,).
 
     Args:
         config: of the model; its scope says whether it sees a window or the whole map.
@@ -72,39 +75,42 @@ def view(
         origin: (2,) corner of the map's first cell [m].
 
     Returns:
-        The image (X', Y', Z); the origin (2,) of the local frame [m].
+        The image (X', Y', Z), and the origin (2,) of the local frame in the map [m]: the center of
+        the image.
     """
     if config.scope == "window":
         image = local_map.window(padded, q, resolution, origin)
         return image, local_map.center(q, resolution, origin)
+    # The whole map. Images have one size: smaller maps are filled up, larger maps are cropped.
     side, half = CELLS[config.task], local_map.SIDE // 2
     size = np.array(padded.shape[:2]) - 2 * half
-    excess = np.maximum(side - size, 0)  # maps may be smaller, or larger and then are cut
+    missing = np.maximum(side - size, 0)
     solid = 1.0 if config.paper else 0.0
     image = jnp.pad(
         padded[half:-half, half:-half],
-        [(excess[0] // 2, excess[0] - excess[0] // 2)]
-        + [(excess[1] // 2, excess[1] - excess[1] // 2), (0, 0)],
+        [(missing[0] // 2, missing[0] - missing[0] // 2)]
+        + [(missing[1] // 2, missing[1] - missing[1] // 2), (0, 0)],
         constant_values=solid,
     )
     first = np.maximum(size - side, 0) // 2
     image = image[first[0] : first[0] + side, first[1] : first[1] + side]
-    corner = first - excess // 2
+    corner = first - missing // 2
     return image, origin[:2] + (jnp.asarray(corner) + side / 2) * resolution
 
 
 def load_examples(
     config: ModelConfig, robot: MobileRobot, dataset: Dataset, *, soft: bool = True
 ) -> Examples:
-    """The rows of a data set that a model learns from.
+    """Put those rows of a data set on the device that a model learns from.
 
-    A discriminator learns from all, a CVAE from good waypoints alone.
+    A discriminator learns from all rows, a CVAE from the good waypoints alone.
 
     Args:
         config: of the model to train.
         robot: whose configurations they are.
         dataset: from :func:`nrp_jax.learning.data.load_dataset`.
-        soft: a discriminator's target falls off with the detour; otherwise it is 0 or 1.
+        soft: the target of a discriminator falls off exponentially with the detour; otherwise it
+            is 1 for good waypoints and 0 for others.
 
     Raises:
         ValueError: the data set is of another task.
@@ -115,13 +121,14 @@ def load_examples(
             "give another data set, or the other --task"
         )
     rows = dataset.rows
-    good = rows["ratio"] <= POSITIVE
+    # Which rows, and how good their waypoints are.
+    good = rows["ratio"] <= GOOD_RATIO
     if config.kind == "cvae":
         rows = {name: column[good] for name, column in rows.items()}
         target = weight = np.ones(good.sum())
     else:
         detour = np.maximum(rows["ratio"] - 1.0, 0.0)
-        target = np.exp(-detour / (POSITIVE - 1.0)) if soft else good.astype(np.float32)
+        target = np.exp(-detour / (GOOD_RATIO - 1.0)) if soft else good.astype(np.float32)
         weight = np.ones(len(good))
     grids = [grid.flatten() if robot.planar else grid for grid in dataset.grids]
     return make_examples(config, robot, grids, rows, target=target, weight=weight)
@@ -147,20 +154,22 @@ def make_examples(
         weight: (n,) in the loss.
     """
     maps = _stack([surrounding_map(config, make_field(grid)) for grid in grids], config)
+    # Number the queries of all homes; ``group`` (n,) is the query of each row.
     _, first, group, counts = np.unique(
         rows["home"].astype(np.int64) << 32 | rows["query"].astype(np.int64),
         return_index=True,
         return_inverse=True,
         return_counts=True,
     )
+    # A table (Q, W) of row indices. Empty slots repeat a query's first row, with weight 0.
     order = np.argsort(group, kind="stable")
     slot = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
-    table = np.repeat(first[:, None], counts.max(), axis=1)  # empty slots repeat the first row
+    table = np.repeat(first[:, None], counts.max(), axis=1)
     table[group[order], slot] = order
     filled = np.arange(counts.max()) < counts[:, None]
     ends = np.stack([rows["q_start"][first], rows["q_goal"][first]], axis=1)
     q = np.concatenate([ends, rows["waypoint"][table]], axis=1).astype(np.float32)
-    # Once for all rows: kinematics inside the training step would take longest of all to compile.
+    # Link frames are computed once: kinematics inside the training step compile very slowly.
     points = batch_link_features(robot, q.reshape(-1, q.shape[-1]))
     return Examples(
         maps=jnp.asarray(maps),
@@ -173,7 +182,7 @@ def make_examples(
 
 
 def _stack(maps: list[jax.Array], config: ModelConfig) -> np.ndarray:
-    """Maps of several sizes as one array, filled up with solid cells."""
+    """Maps of several sizes as one array (H, X, Y, Z), filled up with solid cells."""
     size = np.max([one.shape for one in maps], axis=0)
     stacked = np.full((len(maps), *size), 1.0 if config.paper else 0.0, np.float16)
     for k, one in enumerate(maps):
@@ -188,12 +197,20 @@ def make_batch(
     chosen: jax.Array,
     key: jax.Array | None = None,
 ) -> Batch:
-    """Images and features of chosen queries (n,); with a key each is turned and mirrored at random.
+    """Images and features of chosen queries.
 
-    Homes have no preferred direction, so every query stands for eight.
+    Args:
+        config: of the model to train.
+        robot: whose configurations they are.
+        examples: training rows.
+        chosen: (n,) indices of queries.
+        key: turns and mirrors each query at random, if given. Homes have no preferred direction,
+            so that a query stands for eight.
     """
+    # Images, configurations and link frames in the local frames.
     image, q, points = jax.vmap(lambda index: _local(config, examples, index))(chosen)
     if key is not None:
+        # One of the eight symmetries of a square for each query.
         symmetry = jax.random.randint(key, (2, len(chosen)), 0, jnp.array([[4], [2]]))
         quarter, mirror = symmetry[0], symmetry[1] == 1
         image = jax.vmap(features.turn_image)(image, quarter, mirror)
@@ -213,6 +230,14 @@ def make_batch(
     )
 
 
+def empty_batch(config: ModelConfig, robot: MobileRobot, examples: Examples) -> Batch:
+    """A batch of one query that holds zeros, to initialize networks with its shapes."""
+    shapes = jax.eval_shape(
+        lambda examples: make_batch(config, robot, examples, jnp.zeros(1, jnp.int32)), examples
+    )
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+
 def describe(config: ModelConfig, robot: MobileRobot, q: jax.Array, points: jax.Array) -> jax.Array:
     """Features (n, C, E) of local configurations (n, C, D) with link frames (n, C, F, 3)."""
     one = functools.partial(features.configuration_features, config, robot)
@@ -226,7 +251,7 @@ def _local(config: ModelConfig, examples: Examples, index: jax.Array):
         image = local_map.stacked_window(examples.maps, home, q[0])
         center = local_map.center(q[0])
     else:
-        image, center = view(
+        image, center = local_image(
             config, examples.maps[home], q[0], jnp.float32(RESOLUTION), jnp.zeros(2)
         )
     points = points - jnp.append(center, 0.0)
@@ -234,7 +259,7 @@ def _local(config: ModelConfig, examples: Examples, index: jax.Array):
 
 
 def relations(robot: MobileRobot, image: jax.Array, q: jax.Array, points: jax.Array) -> jax.Array:
-    """How candidates lie to their surroundings and to the ends.
+    """Numbers that relate candidates to the surroundings, the start and the goal.
 
     Args:
         robot: whose configurations they are.
@@ -243,15 +268,15 @@ def relations(robot: MobileRobot, image: jax.Array, q: jax.Array, points: jax.Ar
         points: (2 + C, F, 3) their link frames [m].
 
     Returns:
-        (C, R): what the image holds along the way from the start, at last where the candidate
-        stands; steps of base and arm from the start and to the goal.
+        (C, R) for each candidate: what the image holds at points of the robot on its path from the
+        start to the candidate; and the distances of base and arm from the start and to the goal.
     """
     standing = jax.vmap(functools.partial(features.standing_points, robot))(q, points)
     passed = jax.vmap(features.passed_points, (None, 0))(standing[0], standing[2:])
-    parts = [read(image, passed), *(features.steps(robot, q[2:], end) for end in q[:2])]
+    parts = [read_image(image, passed), *(features.steps(robot, q[2:], end) for end in q[:2])]
     return jnp.concatenate(parts, axis=-1)
 
 
-def read(image: jax.Array, points: jax.Array) -> jax.Array:
-    """What an image (X, Y, Z) holds at local points (..., 3) [m], (...)."""
+def read_image(image: jax.Array, points: jax.Array) -> jax.Array:
+    """What an image (X, Y, Z) holds in the cells of local points (..., 3) [m], (...)."""
     return image.reshape(-1)[features.cells(points, image.shape, RESOLUTION)]

@@ -1,4 +1,4 @@
-"""Trained models on disk: one ``.npz`` of arrays and a description, written all at once."""
+"""Trained models on disk: one ``.npz`` with the weights and a description of the network."""
 
 import dataclasses
 import json
@@ -15,7 +15,7 @@ import numpy as np
 from nrp_jax.learning.models import CVAE, Discriminator, ModelConfig
 from vrrt_jax.core.files import replacing
 
-VERSION = 2  # of what the networks see, see :mod:`nrp_jax.learning.features`
+VERSION = 2  # of the features that networks see; models of other versions are refused
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -24,21 +24,21 @@ class Model:
 
     config: ModelConfig
     variables: Any  # flax variables: params, and batch_stats of the published models
-    info: dict[str, Any]  # how it was trained, how well it did
-
-    @property
-    def module(self) -> Discriminator | CVAE:
-        """The flax module that the variables belong to."""
-        return build_module(self.config, self.info["num_outputs"])
+    info: dict[str, Any]  # "num_outputs", and how the model was trained, with its best epoch
 
 
 def build_module(config: ModelConfig, num_outputs: int) -> Discriminator | CVAE:
-    """The flax module of a configuration; a CVAE writes ``num_outputs`` features."""
+    """Build the flax module of a configuration.
+
+    Args:
+        config: the architecture.
+        num_outputs: features that a CVAE generates; unused for a discriminator.
+    """
     return Discriminator(config) if config.kind == "discriminator" else CVAE(config, num_outputs)
 
 
 def save_model(model: Model, path: str | Path) -> None:
-    """Write a model; a killed process leaves the former file or the new one."""
+    """Write a model, in half precision; a killed process leaves the old file or the new one."""
     path = Path(path)
     flat = flax.traverse_util.flatten_dict(jax.device_get(model.variables), sep="/")
     arrays: dict[str, Any] = {
@@ -54,7 +54,7 @@ def load_model(path: str | Path) -> Model:
     """Read a model that :func:`save_model` wrote.
 
     Raises:
-        ValueError: there is none, it cannot be read, or it is of another architecture.
+        ValueError: there is no model, the file is damaged, or it is of another version.
     """
     path = Path(path)
     if path.is_dir():
@@ -71,6 +71,7 @@ def load_model(path: str | Path) -> Model:
                 for name in saved.files
                 if name != "description"
             }
+        # JSON has no tuples.
         given = description["config"].items()
         fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given}
         config, info = ModelConfig(**fields), description["info"]

@@ -1,8 +1,9 @@
 """How hard a home is: the share of long queries that a plain RRT-IS solves.
 
-RRT-IS is RRT that extends until it hits something and keeps every sub-step on the way as a node
-(Lu et al. 2024). Homes for training should be about as hard as the paper's: 0.2 to 0.6 at 300
-expansions, and :func:`fair_house` sees to it.
+RRT-IS is RRT that extends a node until it hits something and inserts every sub-step of the
+extension as a node (Lu et al. 2024). Training needs fair homes, neither too hard nor too easy. A
+home is fair if it is about as hard as the paper's: RRT-IS solves 20 to 60 % of its long queries
+within 300 expansions. :func:`fair_house` looks for one.
 """
 
 import jax
@@ -17,15 +18,17 @@ from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld, batch_is_free, build_world
 from vrrt_jax.core.planners.rrt import sample_configurations
 
-EXPANSIONS = 300
-MIN_GEODESIC = 5.0  # of the base, from start to goal [m]
-GOAL_BIAS = 0.1
-FAIR = (0.2, 0.6)  # difficulty of a home that is taken
-_CAPACITY, _SUB_STEPS = 1 << 13, 160
+EXPANSIONS = 300  # of RRT-IS for a query
+MIN_GEODESIC = 5.0  # shortest path of the base from start to goal in a long query [m]
+GOAL_BIAS = 0.1  # share of expansions that aim at the goal
+FAIR = (0.2, 0.6)  # difficulty of a fair home
+_CAPACITY = 1 << 13  # nodes of a tree
+_SUB_STEPS = 160  # of an extension, at most
+_CHUNK = 16  # sub-steps checked at a time
 
 
 def difficulty(robot: MobileRobot, grid: Grid, num: int = 20, seed: int = 0) -> float:
-    """Share of ``num`` random long queries in a home that RRT-IS solves; lower is harder.
+    """Measure the share of random long queries in a home that RRT-IS solves; lower is harder.
 
     Args:
         robot: from :func:`nrp_jax.load_robot`.
@@ -44,10 +47,10 @@ def difficulty(robot: MobileRobot, grid: Grid, num: int = 20, seed: int = 0) -> 
 
 
 def fair_house(robot: MobileRobot, seed: int) -> House:
-    """The first home of a seed that is about as hard for a planar robot as the paper's are.
+    """Generate the first fair home of a seed.
 
-    The paper's figures are the snake's, so that homes for other robots are taken as they come: for
-    the Fetch hardly any query is solved, not even in rooms without clutter.
+    The paper's figures are those of the snake, a planar robot. Homes for other robots are taken as
+    they come: for the Fetch RRT-IS solves hardly any query, not even in rooms without clutter.
 
     Raises:
         RuntimeError: all of 20 homes are too hard or too easy.
@@ -62,11 +65,12 @@ def fair_house(robot: MobileRobot, seed: int) -> House:
 def long_queries(
     robot: MobileRobot, world: GridWorld, grid: Grid, num: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Free starts and goals (num, D) whose bases are at least 5 m apart on foot.
+    """Draw free starts and goals (num, D), at least 5 m apart along the floor.
 
     Raises:
         ValueError: there are none.
     """
+    # Random free configurations, and the floor cell of each base.
     q = sample_configurations(world, jax.random.key(seed), 4096)
     q = np.asarray(q)[np.asarray(batch_is_free(world, q))]
     index = np.full(grid.occupied.shape[:2], -1)
@@ -75,11 +79,12 @@ def long_queries(
     cell = np.floor((q[:, :2] - grid.origin[:2]) / grid.resolution).astype(int)
     node = index[tuple(cell.T)]
     q, node = q[node >= 0], node[node >= 0]
+    # Random starts, each with a random goal that is far along the floor but can be reached.
     rng = np.random.default_rng(seed)
     graph, pairs = _floor_graph(index, grid.resolution), []
     for start in rng.integers(0, len(q), 20 * num) if len(q) else ():
-        way = csgraph.dijkstra(graph, indices=node[start])[node]
-        far = np.flatnonzero((way >= MIN_GEODESIC) & np.isfinite(way))
+        geodesic = csgraph.dijkstra(graph, indices=node[start])[node]
+        far = np.flatnonzero((geodesic >= MIN_GEODESIC) & np.isfinite(geodesic))
         if len(far):
             pairs.append((start, rng.choice(far)))
         if len(pairs) == num:
@@ -92,7 +97,12 @@ def long_queries(
 
 
 def _floor_graph(index: np.ndarray, resolution: float) -> sparse.csr_matrix:
-    """Steps to the eight neighbors between cells numbered by ``index`` (X, Y), -1 elsewhere."""
+    """Lengths [m] of steps from floor cells to their eight neighbors, a graph.
+
+    Args:
+        index: (X, Y) number of each floor cell, -1 elsewhere.
+        resolution: side of a cell [m].
+    """
     edges = []
     for i, j in ((1, 0), (0, 1), (1, 1), (1, -1)):
         a, b = index[: len(index) - i], index[i:]
@@ -108,7 +118,12 @@ def _floor_graph(index: np.ndarray, resolution: float) -> sparse.csr_matrix:
 
 @jax.jit
 def rrt_is(world: GridWorld, q_start: jax.Array, q_goal: jax.Array, key: jax.Array) -> jax.Array:
-    """Whether RRT-IS reaches the goal (D,) from the start (D,) within 300 expansions, () bool."""
+    """Whether RRT-IS reaches the goal (D,) from the start (D,) within 300 expansions, () bool.
+
+    One extension after the other, as the paper counts expansions. The planner's RRT-IS
+    (:class:`nrp_jax.planners.nrp.RRT`) extends many nodes at a time and would measure another
+    difficulty; homes of data sets depend on this one.
+    """
     nodes = jnp.zeros((_CAPACITY, q_start.shape[0])).at[0].set(q_start)
     step = jnp.arange(1, _SUB_STEPS + 1)
 
@@ -118,21 +133,43 @@ def rrt_is(world: GridWorld, q_start: jax.Array, q_goal: jax.Array, key: jax.Arr
 
     def expand(state):
         nodes, size, expansion, _ = state
+        # The node nearest to a random configuration, or to the goal.
         key_q, key_bias = jax.random.split(jax.random.fold_in(key, expansion))
         aims = jax.random.uniform(key_bias) < GOAL_BIAS
         target = jnp.where(aims, q_goal, sample_configurations(world, key_q, 1)[0])
         among = (jnp.arange(_CAPACITY) < size)[None]
         nearest = nodes[jnp.argmin(world.distances(nodes, target[None], among)[0])]
+        # The sub-steps from there to the target, and how many of them come before a collision.
         edge = world.edge(nearest, target)
         num = jnp.minimum(world.parts(edge, _SUB_STEPS), _SUB_STEPS)
         points = jax.vmap(
             lambda f: world.normalize(world.end(nearest, world.truncate(edge, f)))
         )(step / num)  # fmt: skip
-        free = jax.vmap(world.is_free)(points) & (step <= num)
-        passed = jnp.sum(jnp.cumprod(free))
+        passed = _free_steps(world, points, num)
+        # All of these become nodes.
         slot = jnp.where(step <= passed, size + step - 1, _CAPACITY)
         nodes = nodes.at[slot].set(points, mode="drop")
         return nodes, size + passed, expansion + 1, aims & (passed == num)
 
     state = (nodes, jnp.int32(1), jnp.int32(0), jnp.array(False))
     return jax.lax.while_loop(goes_on, expand, state)[3]
+
+
+def _free_steps(world: GridWorld, points: jax.Array, num: jax.Array) -> jax.Array:
+    """How many of the first ``num`` () points (S, D) come before the first that collides.
+
+    :func:`vrrt_jax.core.edges.free_prefix` checks all sub-steps of many edges in one batch. Here
+    is a single edge, most of whose sub-steps lie behind the first collision: chunks are faster.
+    """
+
+    def goes_on(state):
+        checked, passed = state
+        return (checked == passed) & (checked < num)
+
+    def check(state):
+        checked, passed = state
+        free = jax.vmap(world.is_free)(jax.lax.dynamic_slice_in_dim(points, checked, _CHUNK))
+        free &= checked + jnp.arange(1, _CHUNK + 1) <= num
+        return checked + _CHUNK, passed + jnp.sum(jnp.cumprod(free))
+
+    return jax.lax.while_loop(goes_on, check, (jnp.int32(0), jnp.int32(0)))[1]

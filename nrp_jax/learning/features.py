@@ -1,7 +1,9 @@
-"""What the networks see of configurations: exact kinematics, in a frame at the start's base.
+"""Features of configurations, and symmetries of the local frame.
 
-Frame and goal encoding after Lu et al. 2024; angles are given by cosine and sine, so that there is
-no jump at half a turn. Letters: ``D`` joints, ``E`` features.
+Networks see configurations in the local frame: its origin is the center of the image around the
+start, its axes are the map's (Lu et al. 2024). Features hold the joints and, by exact kinematics,
+the positions of the link frames. Angles are given by cosine and sine, so that nothing jumps at half
+a turn. Letters: ``D`` joints, ``F`` link frames, ``P`` points, ``E`` features.
 """
 
 import jax
@@ -13,14 +15,14 @@ from nrp_jax.scene.field import DistanceField
 from nrp_jax.scene.robots import MobileRobot
 from vrrt_jax.core.edges import short_way
 
-FAR = 6.0  # goals farther than this look as if they were this far [m]
-CLEAR = 1.0  # distances to obstacles beyond this do not matter [m]
-WAY = 4  # places along an edge at which the surroundings are read
+MAX_GOAL_DISTANCE = 6.0  # farther goals are moved to this distance [m]
+MAX_CLEARANCE = 1.0  # larger distances to obstacles are cut off [m]
+PATH_SAMPLES = 4  # places along an edge at which the surroundings are read
 HEADING = 2  # the joint that turns the whole robot, for both robots
 
 
 def to_local(q: jax.Array, center: jax.Array) -> jax.Array:
-    """Configurations (..., D) in the frame at a place (..., 2) of the map [m]; no rotation."""
+    """Configurations (..., D) in the frame at a place (..., 2) of the map [m], with its axes."""
     return jnp.concatenate([q[..., :2] - center, q[..., 2:]], axis=-1)
 
 
@@ -34,7 +36,7 @@ def configuration_features(
 ) -> jax.Array:
     """Features (E,) of one local configuration (D,): joints, then link frames.
 
-    The published models see angles [rad], the others their cosines and sines.
+    The published models see angles [rad], the others see the cosines and sines of the angles.
 
     Args:
         config: of the model.
@@ -54,17 +56,24 @@ def configuration_features(
 def goal_features(
     config: ModelConfig, robot: MobileRobot, q: jax.Array, points: jax.Array
 ) -> jax.Array:
-    """Features (E',) of one local goal (D,): as above, and where it lies.
+    """Features (E',) of one local goal (D,): those of its configuration, and where it lies.
 
-    The published models add the direction; the others bring far goals to ``FAR`` and add direction
-    and the logarithm of the distance.
+    The published models add the direction [rad]. The others move far goals to
+    ``MAX_GOAL_DISTANCE``, and add the direction as a unit vector and the logarithm of the distance.
+
+    Args:
+        config: of the model.
+        robot: whose configuration it is.
+        q: (D,) goal in the local frame.
+        points: (F, 3) its link frames [m].
     """
     place = q[:2]
     if config.paper:
         direction = jnp.arctan2(place[1], place[0])
         return jnp.append(configuration_features(config, robot, q, points), direction)
+    # Far goals move towards the start, together with their link frames.
     distance = jnp.sqrt(jnp.sum(place**2) + 1e-6)
-    back = place * (jnp.minimum(1.0, FAR / distance) - 1.0)
+    back = place * (jnp.minimum(1.0, MAX_GOAL_DISTANCE / distance) - 1.0)
     q, points = q.at[:2].add(back), points.at[:, :2].add(back)
     features = configuration_features(config, robot, q, points)
     return jnp.concatenate([features, place / distance, jnp.log(distance)[None]])
@@ -79,28 +88,34 @@ def to_configuration(config: ModelConfig, robot: MobileRobot, features: jax.Arra
     linear, cosine, sine = jnp.split(
         features[..., : num + is_angle.sum()], [num - is_angle.sum(), num], axis=-1
     )
+    # Features hold sliding joints first, then turning ones: back to the robot's order.
     order = np.argsort(np.concatenate([np.flatnonzero(~is_angle), np.flatnonzero(is_angle)]))
     return jnp.concatenate([linear, jnp.arctan2(sine, cosine)], axis=-1)[..., order]
 
 
 def standing_points(robot: MobileRobot, q: jax.Array, points: jax.Array) -> jax.Array:
-    """Where a local configuration (D,) stands: its link frames (F, 3) and its base, (P, 3) [m]."""
+    """Points (P, 3) of the robot in a local configuration (D,): link frames (F, 3) and base [m]."""
     heights = jnp.array([0.0] if robot.planar else [0.1, 0.5, 0.9])
     base = jnp.append(q[:2], 0.0) + heights[:, None] * jnp.array([0.0, 0.0, 1.0])
     return jnp.concatenate([points, base])
 
 
 def passed_points(start: jax.Array, end: jax.Array) -> jax.Array:
-    """Points (WAY * P, 3) near the way of points from their start (P, 3) to their end (P, 3) [m].
+    """Points (PATH_SAMPLES * P, 3) that the robot passes on its path from one place to another [m].
 
-    They go straight here, as they nearly do where the posture changes little.
+    Straight lines stand in for the true paths, which are nearly straight where the posture changes
+    little.
+
+    Args:
+        start: (P, 3) points of the robot at the start.
+        end: (P, 3) the same points at the end.
     """
-    fraction = jnp.arange(1, WAY + 1)[:, None, None] / WAY
+    fraction = jnp.arange(1, PATH_SAMPLES + 1)[:, None, None] / PATH_SAMPLES
     return (start + fraction * (end - start)).reshape(-1, 3)
 
 
 def cells(points: jax.Array, shape: tuple[int, ...], resolution: float) -> jax.Array:
-    """Flat indices (...) of the cells of a window (X, Y, Z) that hold local points (..., 3)."""
+    """Flat indices (...) of the cells of an image (X, Y, Z) that hold local points (..., 3) [m]."""
     flat = jnp.int32(0)
     for axis, middle in enumerate((shape[0] // 2, shape[1] // 2, 0)):
         if shape[axis] > 1:  # axis by axis: XLA's CPU loops over a last axis of three are slow
@@ -110,22 +125,23 @@ def cells(points: jax.Array, shape: tuple[int, ...], resolution: float) -> jax.A
 
 
 def steps(robot: MobileRobot, q: jax.Array, end: jax.Array) -> jax.Array:
-    """How far base and arm are apart (..., 2) in configurations (..., D) and (D,) [m] and [rad]."""
+    """Distances (..., 2) of base [m] and arm [rad] between configurations (..., D) and (D,)."""
     squared = short_way(q - end, robot.is_continuous) ** 2
     base, arm = squared[..., :2].sum(-1), squared[..., robot.base_dim :].sum(-1)
     return jnp.sqrt(jnp.stack([base, arm], axis=-1) + 1e-12)
 
 
 def surroundings(field: DistanceField) -> jax.Array:
-    """The map (X, Y, Z) behind a field: distances to obstacles at each cell's middle [m].
+    """Distances (X, Y, Z) from each cell's center to the nearest obstacle, 0 in solid cells [m].
 
-    Distances beyond ``CLEAR`` count as that; solid cells hold 0.
+    Distances beyond ``MAX_CLEARANCE`` count as that.
     """
     planar = field.values.shape[2] == 1
+    # The lattice points at the centers of the cells; the field has a rim of one cell in x and y.
     fine = field.fine
-    first = fine + fine // 2  # the field has a rim of one cell in x and y
+    first = fine + fine // 2
     inside = field.values[first:-first:fine, first:-first:fine]
-    return jnp.minimum(inside if planar else inside[:, :, fine // 2 :: fine], CLEAR)
+    return jnp.minimum(inside if planar else inside[:, :, fine // 2 :: fine], MAX_CLEARANCE)
 
 
 def turn_image(image: jax.Array, quarter: jax.Array, mirror: jax.Array) -> jax.Array:
@@ -142,6 +158,7 @@ def turn_configuration(
 
     The snake's joints count clockwise from +y, the Fetch's heading counts from +x to +y.
     """
+    # Mirroring y changes the sign of some joints, and turns the snake's first joint by half a turn.
     if robot.planar:
         sign = np.array([1, -1, *[-1] * 6])
         offset = np.array([0, 0, np.pi, *[0] * 5])
@@ -152,6 +169,7 @@ def turn_configuration(
         offset = np.zeros(len(sign))
         clockwise = 1
     q = jnp.where(mirror, sign * q + offset, q)
+    # A quarter turn changes the heading and the place, no other joint.
     heading = q[..., HEADING] + clockwise * quarter * (jnp.pi / 2)
     heading = jnp.mod(heading + jnp.pi, 2 * jnp.pi) - jnp.pi
     return _turn(q.at[..., HEADING].set(heading), quarter)

@@ -1,8 +1,8 @@
 """Local windows: what the networks see of a map around the base of the robot.
 
-A window is 4 x 4 m (x 2 m), aligned with the map, centered on the corner of cells nearest to the
-base: cell (i, j) of it covers [0.1 (i - 20), 0.1 (i - 19)) from there. Outside the map everything
-is occupied.
+A window is 4 x 4 m (x 2 m) and aligned with the map. Its center is the corner of cells nearest to
+the base, which is also the origin of the local frame. Cell (i, j) of the window covers x from
+0.1 (i - 20) to 0.1 (i - 19) m in the local frame, and y alike. Outside the map all is solid.
 """
 
 from typing import Any

@@ -1,7 +1,7 @@
-"""The learned models: a discriminator that ranks waypoints, a CVAE that generates them.
+"""The networks: a discriminator that ranks waypoints, and a CVAE that generates them.
 
-Both see the surroundings of the start as an image, encoded once and shared by all candidates
-(Lu et al. 2024, section IV). Letters: ``n`` starts, ``C`` candidates each, ``E`` features.
+Both see the surroundings of the start as an image, which is encoded once for all candidates (Lu et
+al. 2024, section IV). Letters: ``n`` starts, ``C`` candidates of a start, ``E`` features.
 """
 
 import dataclasses
@@ -16,23 +16,24 @@ TASKS = ("snake", "fetch")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ModelConfig:
-    """Architecture and input of a model; part of its checkpoint."""
+    """Architecture and inputs of a network; kept with its weights."""
 
-    task: str  # snake or fetch
-    kind: str  # discriminator or cvae
-    scope: str = "window"  # what is seen: the local window, or the whole map
+    task: str  # "snake" or "fetch"
+    kind: str  # "discriminator" or "cvae"
+    scope: str = "window"  # what the network sees: the local "window", or the whole "map"
     paper: bool = False  # the published architecture and its raw inputs
     patches: tuple[int, ...] = (4, 2)  # side of the patches each encoder layer merges
     channels: tuple[int, ...] = (32, 64)  # width of each encoder layer
     context: int = 128  # width of the layers that join image, start and goal
-    width: int = 64  # width of the layers behind, for each candidate or latent
-    lookup: bool = True  # tell what the image holds where each candidate would be; windows only
+    width: int = 64  # width of the layers after those, for each candidate or latent
+    # Add to each candidate what the image holds where the robot would be; for windows only.
+    lookup: bool = True
     latent: int = 8  # dimensions of the CVAE's latent
     kl_weight: float = 0.01  # of the CVAE's KL term
 
     @classmethod
     def default(cls, task: str, kind: str, scope: str = "window") -> "ModelConfig":
-        """The light architecture: patches joined by matrix products, height as channels."""
+        """The light architecture: patches merged by matrix products, heights as channels."""
         check_choices(task, kind, scope)
         wide = {"channels": (64, 96), "context": 192} if task == "fetch" else {}
         if scope == "map":
@@ -45,7 +46,7 @@ class ModelConfig:
 
     @classmethod
     def published(cls, task: str, kind: str, scope: str = "window") -> "ModelConfig":
-        """The paper's architecture, as its code has it."""
+        """The architecture of the paper, as its published code has it."""
         check_choices(task, kind, scope)
         width = 512 if task == "snake" else 1024
         latent = 5 if task == "snake" else 8
@@ -65,7 +66,8 @@ def check_choices(task: str, kind: str, scope: str = "window") -> None:
             raise ValueError(f"unknown {name} '{value}'; have: {', '.join(choices)}")
 
 
-# Features, kernel, stride, padding, normalized, pooled: the convolutions of the published models.
+# The convolutions of the published models, a tuple for each layer:
+# features, kernel, stride, padding, whether normalized, whether pooled.
 _SNAKE = (
     (16, (4, 4), 2, 1, False, False),
     (32, (3, 3), 2, 1, True, False),
@@ -90,7 +92,10 @@ _CONVOLUTIONS = {
 
 
 class PatchEncoder(nn.Module):
-    """Merges patches layer by layer; matrix products are far faster on a CPU than convolutions."""
+    """Merges square patches of cells into one, layer by layer.
+
+    Matrix products are far faster on a CPU than convolutions.
+    """
 
     config: ModelConfig
 
@@ -99,6 +104,7 @@ class PatchEncoder(nn.Module):
         """Features (n, F) of images (n, X, Y, Z), whose heights are channels."""
         x = image
         for side, channels in zip(self.config.patches, self.config.channels, strict=True):
+            # The cells of a patch, side by side, are the channels of one new cell.
             n, width, depth, _ = x.shape
             x = x.reshape(n, width // side, side, depth // side, side, -1)
             x = x.transpose(0, 1, 3, 2, 4, 5).reshape(n, width // side, depth // side, -1)
@@ -127,12 +133,12 @@ class PaperEncoder(nn.Module):
                 x = nn.max_pool(x, (2,) * len(kernel), (2,) * len(kernel))
         x = x.reshape(len(x), -1)
         if config.task == "fetch" and config.scope == "map":
-            x = _normalised(nn.Dense(2048)(x), train)
+            x = _normalized(nn.Dense(2048)(x), train)
         return x
 
 
 def _with_coordinates(image: jax.Array) -> jax.Array:
-    """Occupancy and the centers of its cells [m], as four channels (n, X, Y, Z, 4)."""
+    """Occupancy, and the coordinates of the cells' centers [m], as channels (n, X, Y, Z, 4)."""
     size = jnp.array(image.shape[1:])
     cells = jnp.stack(jnp.meshgrid(*map(jnp.arange, image.shape[1:]), indexing="ij"), axis=-1)
     middle = jnp.array([0.5, 0.5, 0.0]) * size  # heights count from the floor
@@ -141,7 +147,8 @@ def _with_coordinates(image: jax.Array) -> jax.Array:
     return jnp.concatenate([image[..., None], centers.astype(image.dtype)], axis=-1)
 
 
-def _normalised(x: jax.Array, train: bool, slope: float = 0.01) -> jax.Array:
+def _normalized(x: jax.Array, train: bool, slope: float = 0.01) -> jax.Array:
+    """Batch normalization and a leaky ReLU."""
     x = nn.BatchNorm(use_running_average=not train, momentum=0.9)(x)
     return nn.leaky_relu(x, slope)
 
@@ -172,24 +179,26 @@ class Discriminator(nn.Module):
             start: (n, E) features.
             goal: (n, E') features.
             candidates: (n, C, E'') features, or (1, C, E'') if all starts share them.
-            relation: (n, C, R) to the surroundings and the ends, in numbers; unused
-                without ``lookup``.
+            relation: (n, C, R) from :func:`nrp_jax.learning.batches.relations`; unused without
+                ``lookup``.
             train: normalize by this batch.
         """
         config = self.config
         context = jnp.concatenate([_encoder(config)(image, train), start, goal], axis=-1)
         if config.paper:
-            # The published first layer reads all features side by side: the same sum, in parts.
+            # The published first layer reads context and candidate side by side. Its product is a
+            # sum of two, of which the context's is computed once for all candidates.
             x = nn.Dense(config.width)(context)[:, None]
             x = x + nn.Dense(config.width, use_bias=False)(candidates)
-            x = _normalised(x, train)
+            x = _normalized(x, train)
             if config.task == "fetch":
                 for _ in range(2):
-                    x = _normalised(nn.Dense(config.width)(x), train)
+                    x = _normalized(nn.Dense(config.width)(x), train)
                 x = nn.leaky_relu(nn.Dense(256)(x), 0.01)
             return nn.Dense(1)(x)[..., 0]
         context = nn.relu(nn.Dense(config.context)(context))
         context = nn.relu(nn.Dense(config.context)(context))
+        # The context shifts and scales the features of every candidate.
         shift, scale = jnp.split(nn.Dense(2 * config.width)(context)[:, None], 2, axis=-1)
         x = nn.Dense(config.width)(candidates)
         if config.lookup:
@@ -200,13 +209,13 @@ class Discriminator(nn.Module):
 
 
 class CVAE(nn.Module):
-    """Generates waypoints from a latent; its encoder is for training alone."""
+    """A conditional variational autoencoder of waypoints; planning uses its decoder alone."""
 
     config: ModelConfig
     num_outputs: int
 
     def setup(self):
-        """Towers of encoder and decoder; the light model shares the image's."""
+        """Build encoder and decoder; in the light model they share the image's encoder."""
         config = self.config
         self.decoder_image = _encoder(config)
         self.encoder_image = _encoder(config) if config.paper else None
@@ -232,7 +241,7 @@ class CVAE(nn.Module):
 
     def _decode(self, seen, start, goal, z, train: bool):
         made = self.decoder(jnp.concatenate([seen, start, goal], axis=-1), z, train)
-        # What is to be generated is a step away from the start.
+        # The light model generates the step from the start.
         return made if self.config.paper else made + start[:, None]
 
 
@@ -249,9 +258,9 @@ class Layers(nn.Module):
         if config.paper:
             x = nn.Dense(config.width)(context)[:, None]
             x = x + nn.Dense(config.width, use_bias=False)(inputs)
-            x = _normalised(x, train, 0.0)
+            x = _normalized(x, train, 0.0)
             for _ in range(2):
-                x = _normalised(nn.Dense(config.width)(x), train, 0.0)
+                x = _normalized(nn.Dense(config.width)(x), train, 0.0)
             return nn.Dense(self.num_outputs)(x)
         context = nn.relu(nn.Dense(config.context)(context))
         x = nn.Dense(config.width)(context)[:, None] + nn.Dense(config.width)(inputs)
@@ -262,7 +271,7 @@ class Layers(nn.Module):
 
 
 def discriminator_loss(logits: jax.Array, target: jax.Array, mask: jax.Array) -> jax.Array:
-    """Binary cross-entropy (), over the rows of (n, C) that the mask keeps."""
+    """Mean binary cross-entropy () of the candidates (n, C), weighted by the mask."""
     entropy = jax.nn.softplus(logits) - target * logits
     return jnp.sum(entropy * mask) / jnp.maximum(jnp.sum(mask), 1.0)
 

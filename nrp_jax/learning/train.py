@@ -2,31 +2,30 @@
 
 import argparse
 import dataclasses
-import functools
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import scipy.stats
 from tqdm import tqdm
 
 from nrp_jax.learning import models
-from nrp_jax.learning.batches import Batch, Examples, load_examples, make_batch
+from nrp_jax.learning.batches import Examples, empty_batch, load_examples, make_batch
 from nrp_jax.learning.checkpoint import Model, build_module, save_model
 from nrp_jax.learning.data import fingerprint, load_dataset
 from nrp_jax.learning.models import ModelConfig
+from nrp_jax.learning.objective import init, loss_fn, validate
 from nrp_jax.learning.training_io import (
     CheckpointStore,
     State,
     claim_output_dir,
+    epochs_since_best,
     plot_curves,
-    waited,
     write_log,
 )
 from nrp_jax.scene.robots import MobileRobot, load_robot
@@ -38,10 +37,10 @@ class TrainConfig:
 
     epochs: int = 60
     batch: int = 64  # queries a step
-    learning_rate: float = 2e-3  # at its peak; then a cosine down to nothing
+    learning_rate: float = 2e-3  # at its peak, after which it falls to 0 along a cosine
     weight_decay: float = 1e-3
-    patience: int = 12  # epochs without a better validation loss, then training ends
-    augment: bool = True  # turn and mirror
+    patience: int = 12  # training ends after so many epochs without a better validation loss
+    augment: bool = True  # turn and mirror each query at random
     validation: float = 0.15  # share of the homes that is held out
     seed: int = 0
 
@@ -56,17 +55,19 @@ def train(
     stamp: str = "",
     progress: bool = True,
 ) -> Model:
-    """Train a model; an interrupted training goes on where its last whole epoch ended.
+    """Train a model.
+
+    An interrupted training continues from its last checkpoint, with the same result.
 
     Args:
         config: the architecture.
         robot: whose configurations the examples hold.
         examples: from :func:`nrp_jax.learning.batches.load_examples`.
         out: folder for ``model.npz`` (the best epoch), ``log.csv``, ``curves.png`` and
-            ``checkpoint/`` (the last epoch).
-        settings: of the optimizer.
-        stamp: names the data; a training goes on only with the same.
-        progress: show a bar.
+            ``checkpoint/`` (a recent epoch).
+        settings: of the training.
+        stamp: names the data; a training continues only on the same data.
+        progress: show a progress bar.
 
     Returns:
         The model of the best epoch.
@@ -76,10 +77,12 @@ def train(
             few homes to hold some out.
         RuntimeError: the validation loss is not finite any more.
     """
+    # The folder, and which homes are held out.
     parts = {"model": dataclasses.asdict(config), "settings": dataclasses.asdict(settings)}
     training, validation = split_by_home(np.asarray(examples.home), settings)
     out = claim_output_dir(Path(out), {**parts, "data": stamp})
-    sample = make_batch(config, robot, examples, jnp.zeros(1, jnp.int32))
+    # The network, the optimizer, and a random or restored state.
+    sample = empty_batch(config, robot, examples)
     module = build_module(config, sample.waypoints.shape[-1])
     size = min(settings.batch, len(training))
     steps = settings.epochs * (len(training) // size)
@@ -93,8 +96,9 @@ def train(
         optimizer=optimizer.init(variables["params"]),
         step=jnp.int32(0),
     )
-    keeper = CheckpointStore(out / "checkpoint")
-    state, best, history = keeper.restore(state)
+    store = CheckpointStore(out / "checkpoint")
+    state, best, history = store.restore(state)
+    update = _make_update(config, robot, module, optimizer, settings)
 
     def export() -> Model:
         figures = min(history, key=lambda row: row["loss"])
@@ -103,8 +107,71 @@ def train(
         save_model(model, out / "model.npz")
         return model
 
+    # Epochs that are not done yet.
+    bar = tqdm(
+        range(len(history), settings.epochs),
+        initial=len(history),
+        total=settings.epochs,
+        desc=f"{config.task} {config.kind}",
+        unit="epoch",
+        disable=not progress,
+    )
+    for epoch in bar:
+        if epochs_since_best(history) >= settings.patience:
+            break
+        # One epoch: all training queries in a random order that the seed and the epoch fix.
+        started = time.perf_counter()
+        order = np.random.default_rng([settings.seed, epoch]).permutation(training)
+        losses = []
+        for chosen in order[: len(order) // size * size].reshape(-1, size):
+            state, loss = update(state, examples, jnp.asarray(chosen))
+            losses.append(loss)
+        # The held-out homes decide whether this epoch is the best so far.
+        figures = validate(config, module, robot, state.variables, examples, validation)
+        if not np.isfinite(figures["loss"]):
+            store.close()
+            raise RuntimeError(
+                f"training diverged in epoch {epoch}: the best epoch before is kept in '{out}'; "
+                "lower --learning-rate and choose another folder with --out"
+            )
+        history.append(
+            {
+                "epoch": epoch,
+                "train_loss": float(np.mean(jax.device_get(losses))),
+                **figures,
+                "seconds": round(time.perf_counter() - started, 2),
+            }
+        )
+        if epochs_since_best(history) == 0:
+            best = jax.device_get(state.variables)
+            export()
+        finished = (
+            len(history) == settings.epochs or epochs_since_best(history) >= settings.patience
+        )
+        store.save(state, best, history, last=finished)
+        write_log(history, out)
+        bar.set_postfix_str(f"loss {figures['loss']:.4f}, quality {figures['quality']:.3f}")
+    store.close()
+    model = export()
+    try:
+        plot_curves(history, out / "curves.png", f"{config.task} {config.kind}")
+    except ModuleNotFoundError:
+        print("no curves: matplotlib is missing; pip install 'vrrt-jax[plot]'", file=sys.stderr)
+    return model
+
+
+def _make_update(
+    config: ModelConfig,
+    robot: MobileRobot,
+    module: Any,
+    optimizer: optax.GradientTransformation,
+    settings: TrainConfig,
+) -> Callable[[State, Examples, jax.Array], tuple[State, jax.Array]]:
+    """A compiled step of the optimizer on chosen queries (n,): the new state, and the loss ()."""
+
     @jax.jit
     def update(state: State, examples: Examples, chosen: jax.Array):
+        # Random numbers depend on the step alone, so that a restored training repeats them.
         key, key_turn = jax.random.split(
             jax.random.fold_in(jax.random.key(settings.seed), state.step)
         )
@@ -122,124 +189,18 @@ def train(
         variables = {**state.variables, **changed, "params": params}
         return State(variables=variables, optimizer=moments, step=state.step + 1), loss
 
-    bar = tqdm(
-        range(len(history), settings.epochs),
-        initial=len(history),
-        total=settings.epochs,
-        desc=f"{config.task} {config.kind}",
-        unit="epoch",
-        disable=not progress,
-    )
-    for epoch in bar:
-        if waited(history) >= settings.patience:
-            break
-        started = time.perf_counter()
-        order = np.random.default_rng([settings.seed, epoch]).permutation(training)
-        losses = []
-        for chosen in order[: len(order) // size * size].reshape(-1, size):
-            state, loss = update(state, examples, jnp.asarray(chosen))
-            losses.append(loss)
-        figures = validate(config, module, robot, state.variables, examples, validation)
-        if not np.isfinite(figures["loss"]):
-            keeper.close()
-            raise RuntimeError(
-                f"training diverged in epoch {epoch}: the best epoch before is kept in '{out}'; "
-                "lower --learning-rate and choose another folder with --out"
-            )
-        history.append(
-            {
-                "epoch": epoch,
-                "train_loss": float(np.mean(jax.device_get(losses))),
-                **figures,
-                "seconds": round(time.perf_counter() - started, 2),
-            }
-        )
-        if waited(history) == 0:
-            best = jax.device_get(state.variables)
-            export()
-        finished = len(history) == settings.epochs or waited(history) >= settings.patience
-        keeper.save(state, best, history, last=finished)
-        write_log(history, out)
-        bar.set_postfix_str(f"loss {figures['loss']:.4f}, quality {figures['quality']:.3f}")
-    keeper.close()
-    model = export()
-    try:
-        plot_curves(history, out / "curves.png", f"{config.task} {config.kind}")
-    except ModuleNotFoundError:
-        print("no curves: matplotlib is missing; pip install 'vrrt-jax[plot]'", file=sys.stderr)
-    return model
-
-
-def init(config: ModelConfig, module: nn.Module, batch: Batch, key: jax.Array) -> dict[str, Any]:
-    """Random variables of a module."""
-    last = batch.relation if config.kind == "discriminator" else key
-    return jax.jit(module.init)(key, batch.image, batch.start, batch.goal, batch.waypoints, last)
-
-
-def loss_fn(
-    config: ModelConfig,
-    module: nn.Module,
-    variables: dict[str, Any],
-    batch: Batch,
-    key: jax.Array,
-    train: bool = False,
-):
-    """The loss () of a batch; with it logits or reconstructions, and changed batch statistics."""
-    last = batch.relation if config.kind == "discriminator" else key
-    inputs = (batch.image, batch.start, batch.goal, batch.waypoints, last)
-    outputs, changed = module.apply(variables, *inputs, train=train, mutable=["batch_stats"])
-    if config.kind == "discriminator":
-        return models.discriminator_loss(outputs, batch.target, batch.weight), (outputs, changed)
-    loss, error, _ = models.cvae_loss(config, batch.waypoints, *outputs, mask=batch.weight)
-    return loss, (error, changed)
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _evaluate(config, module, robot, variables, examples, chosen, key):
-    batch = make_batch(config, robot, examples, chosen)
-    loss, (outputs, _) = loss_fn(config, module, variables, batch, key)
-    return loss, outputs, batch.target, batch.weight
-
-
-def validate(
-    config: ModelConfig,
-    module: nn.Module,
-    robot: MobileRobot,
-    variables: dict[str, Any],
-    examples: Examples,
-    chosen: np.ndarray,
-    size: int = 64,
-) -> dict[str, float]:
-    """Loss on chosen queries (n,), and quality.
-
-    Quality is the area under the ROC curve of a discriminator, and minus the reconstruction error
-    of a CVAE.
-    """
-    parts = np.resize(chosen, (-(-len(chosen) // size), size))
-    key = jax.random.key(0)
-    found = [
-        jax.device_get(_evaluate(config, module, robot, variables, examples, part, key))
-        for part in parts
-    ]
-    loss = float(np.mean([part[0] for part in found]))
-    if config.kind == "cvae":
-        return {"loss": loss, "quality": -float(np.mean([part[1] for part in found]))}
-    logits, target, weight = (
-        np.concatenate([part[i].ravel() for part in found]) for i in (1, 2, 3)
-    )
-    return {"loss": loss, "quality": ranking_quality(logits[weight > 0], target[weight > 0])}
-
-
-def ranking_quality(score: np.ndarray, target: np.ndarray) -> float:
-    """Area under the ROC curve: how often a good waypoint scores above a bad one."""
-    good = target > 0.5
-    ranks = scipy.stats.rankdata(score)
-    pairs = max(1, good.sum() * (~good).sum())
-    return float((ranks[good].sum() - good.sum() * (good.sum() + 1) / 2) / pairs)
+    return update
 
 
 def split_by_home(home: np.ndarray, settings: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of training and of validation queries (Q,): no home is in both.
+    """Split queries into training and validation queries; no home is in both.
+
+    Args:
+        home: (Q,) the home of each query.
+        settings: its seed and share of held-out homes.
+
+    Returns:
+        Indices of the training queries and of the validation queries.
 
     Raises:
         ValueError: all queries are of one home.

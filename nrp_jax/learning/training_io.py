@@ -1,4 +1,4 @@
-"""What training leaves behind: checkpoints to go on from, a log, and curves."""
+"""Files that training writes: checkpoints to continue from, a log, and curves."""
 
 import csv
 import json
@@ -14,29 +14,36 @@ import orbax.checkpoint as ocp
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.types import pytree
 
-SECONDS_BETWEEN = 10.0  # checkpoints
+SECONDS_BETWEEN = 10.0  # between two checkpoints, at least [s]
 
 
 @pytree
 class State:
-    """What changes as training goes on."""
+    """The state of a training: what every step changes."""
 
-    variables: Any
+    variables: Any  # flax variables of the network
     optimizer: optax.OptState
-    step: jax.Array  # ()
+    step: jax.Array  # () steps done
 
 
 class CheckpointStore:
-    """A recent epoch on disk, by orbax: a folder appears whole or not at all."""
+    """Keeps a recent epoch on disk, with orbax: a checkpoint appears whole or not at all."""
 
     def __init__(self, folder: Path):
-        """Look into a folder, or make it."""
+        """Open a folder, or make it."""
         options = ocp.CheckpointManagerOptions(max_to_keep=1)
         self._manager = ocp.CheckpointManager(folder.resolve(), options=options)
         self._saved = 0.0
 
     def restore(self, state: State) -> tuple[State, Any, list[dict[str, float]]]:
-        """The state, best variables and history of the last epoch; as given if there is none."""
+        """Read the checkpoint.
+
+        Args:
+            state: a state of the same shapes; returned as it is if there is no checkpoint.
+
+        Returns:
+            The state, the variables of the best epoch, and the history: a row for each epoch.
+        """
         best = jax.device_get(state.variables)
         epoch = self._manager.latest_step()
         if epoch is None:
@@ -49,7 +56,10 @@ class CheckpointStore:
         return state, saved.arrays["best"], saved.history
 
     def save(self, state: State, best: Any, history: list[dict[str, float]], last: bool) -> None:
-        """Write an epoch, then drop the one before; not too often, unless it is the last."""
+        """Write a checkpoint, then drop the one before.
+
+        Skipped within ``SECONDS_BETWEEN`` of the one before, unless this is the last epoch.
+        """
         if not last and time.monotonic() - self._saved < SECONDS_BETWEEN:
             return
         self._saved = time.monotonic()
@@ -59,26 +69,31 @@ class CheckpointStore:
         self._manager.wait_until_finished()
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Finish writing and close the folder."""
         self._manager.close()
 
 
 def _plain(state: State) -> list[jax.Array]:
+    """The state's arrays; orbax cannot restore optax's own types."""
     return jax.tree.leaves(state)
 
 
-def waited(history: list[dict[str, float]]) -> int:
-    """Epochs since the best one."""
+def epochs_since_best(history: list[dict[str, float]]) -> int:
+    """Number of epochs since the one with the lowest validation loss."""
     if not history:
         return 0
     return len(history) - 1 - int(np.argmin([row["loss"] for row in history]))
 
 
 def claim_output_dir(out: Path, parts: dict[str, Any]) -> Path:
-    """Make a folder ours, or see that it was already.
+    """Make a folder for one training, or open it to continue the same training.
+
+    Args:
+        out: folder.
+        parts: what the training depends on; kept in ``training.json``.
 
     Raises:
-        ValueError: it holds a training of something else.
+        ValueError: the folder holds a training with other parts.
     """
     out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(parts, indent=1)
@@ -94,7 +109,7 @@ def claim_output_dir(out: Path, parts: dict[str, Any]) -> Path:
 
 
 def write_log(history: list[dict[str, float]], out: Path) -> None:
-    """Write ``log.csv``."""
+    """Write the history, a row for each epoch, to ``log.csv``."""
     with replacing(out / "log.csv", "w") as handle:
         writer = csv.DictWriter(handle, list(history[0]))
         writer.writeheader()

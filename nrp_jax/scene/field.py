@@ -1,8 +1,8 @@
-"""Distance fields of occupancy grids, with an honest answer between their points.
+"""Distance fields of occupancy grids, with a safe answer between their points.
 
-A field holds exact distances to the solid cells at the points of a lattice. Between them the
-distance changes no faster than one moves, so the value at the nearest point less the way there
-never promises more room than there is.
+A field holds exact distances to the solid cells at the points of a lattice. A distance changes no
+faster than the point moves. So the value at the nearest lattice point, less the distance to that
+lattice point, is never more than the true distance.
 """
 
 import jax
@@ -13,7 +13,7 @@ from scipy import ndimage
 from nrp_jax.homes.grid import Grid
 from vrrt_jax.core.types import pytree
 
-FINE = {2: 8, 3: 2}  # lattice steps a cell, by the map's dimension
+FINE = {2: 8, 3: 2}  # lattice steps a cell, for planar maps and for maps with heights
 
 
 @pytree
@@ -36,10 +36,10 @@ class DistanceField:
 
 
 def make_field(grid: Grid) -> DistanceField:
-    """The field of a map, with a rim of one solid cell around it in x and y.
+    """Compute the field of a map, with a rim of one solid cell around it in x and y.
 
-    The lattice holds the corners of all cells, so the point of a cell that is nearest to a lattice
-    point is one of the lattice too, and the distance transform of the lattice is exact.
+    The lattice holds the corners of all cells. So the point of a cell that is nearest to a lattice
+    point is a lattice point too, and the distance transform of the lattice is exact.
     """
     dims = 2 if grid.planar else 3
     fine = FINE[dims]
@@ -57,13 +57,17 @@ def make_field(grid: Grid) -> DistanceField:
 
 
 def clearance_bound(field: DistanceField, points: jax.Array) -> jax.Array:
-    """A lower bound (n,) of the distance from points (3, n) to the nearest solid cell [m]."""
+    """A lower bound (n,) of the distance from points (3, n) to the nearest solid cell [m].
+
+    Beside the map the distance to the rim counts as negative: all is solid there.
+    """
     shape = field.values.shape
     place = (points - field.origin[:, None]) / field.step
+    # Axis by axis: the flat index of the nearest lattice point, and the squared distance to it.
     index, squared = jnp.int32(0), 0.0
     for axis in range(2 if shape[2] == 1 else 3):
         along, last = place[axis], shape[axis] - 1
-        if axis == 2:  # above and below nothing is solid: it is farther from there still
+        if axis == 2:  # above and below the map nothing is solid: the distance only grows there
             along = jnp.clip(along, 0, last)
         near = jnp.clip(jnp.round(along), 0, last)
         squared += (along - near) ** 2
@@ -72,7 +76,10 @@ def clearance_bound(field: DistanceField, points: jax.Array) -> jax.Array:
 
 
 def _refine(solid: np.ndarray, fine: int, axis: int) -> np.ndarray:
-    """From n cells along an axis to n * fine + 1 lattice points; borders are solid if a side is."""
+    """Turn n cells along an axis into n * fine + 1 lattice points.
+
+    A lattice point between two cells is solid if one of the cells is.
+    """
     solid = np.moveaxis(solid, axis, 0)
     points = np.zeros((solid.shape[0] * fine + 1, *solid.shape[1:]), bool)
     for k in range(fine + 1):

@@ -1,10 +1,11 @@
 """Shortest paths of a car that also reverses (Reeds and Shepp 1990), batched.
 
-A path is at most five arcs and straight lines. Its candidates are a few words such as left, right,
-left, each also driven backwards in time, mirrored, and read from the goal. A candidate may turn
-and reverse as its formula says, whatever the signs: it leads to the goal, so the shortest of them
-is the answer. Lengths are in units of the turning radius inside this file but for the public
-functions. Poses are x, y [m] and heading [rad].
+A path is at most five arcs and straight lines. Which arcs and lines follow each other is called a
+word, such as left, right, left. Each word is also driven backwards in time, mirrored, and read from
+the goal: these are the candidates. The paper's formulas give the lengths of a word's pieces, which
+may be negative: then the car reverses there. Every candidate leads to the goal, so that the
+shortest candidate is the answer. Lengths are in units of the turning radius inside this file,
+except in the public functions. Poses are x, y [m] and heading [rad].
 """
 
 from collections.abc import Callable
@@ -43,8 +44,10 @@ def shortest(a: jax.Array, b: jax.Array, radius: jax.Array | float) -> Curve:
     candidates = jax.lax.optimization_barrier(_candidates(_goal_in_start(a, b, radius)))
     choice = jnp.argmin(candidates[0], axis=0)
     numbers = [jnp.take_along_axis(n, choice[None], axis=0)[0] for n in candidates[1:]]
+    # The word of the best candidate, and how it was driven: the signs of its drives and turns.
     word, mirror = choice // 4, choice % 4
     backwards, mirrored = 1 - 2 * (mirror % 2), 1 - 2 * (mirror // 2)
+    # Its five drives are sums of multiples of the numbers t, u, v and of a quarter turn.
     row = jnp.asarray(_TABLE)[word]  # (..., 25)
     numbers.append(jnp.full_like(numbers[0], _QUARTER))
     drive = [sum(row[..., 5 * k + i] * n for k, n in enumerate(numbers)) for i in range(5)]
@@ -60,16 +63,16 @@ def curve_length(curve: Curve) -> jax.Array:
 
 
 def extent(curve: Curve, radius: jax.Array | float) -> jax.Array:
-    """How far curves go (...): of each piece the way [m], or the turn [rad] if that is more.
+    """How far curves go (...): the sum over pieces of the length [m] or, if larger, the turn [rad].
 
-    On a tight arc a short way is a large turn, which sweeps whatever the robot holds out.
+    On a tight arc a short drive is a large turn, and the turn sweeps the outstretched arm around.
     """
     pieces = _extents(curve, radius)
     return sum(pieces[1:], pieces[0])
 
 
 def _extents(curve: Curve, radius: jax.Array | float) -> list[jax.Array]:
-    """Those of the pieces, 5 of (...)."""
+    """The extents of the pieces, 5 of (...)."""
     tight = jnp.maximum(radius, 1.0)
     return [
         jnp.abs(drive) * jnp.where(turn == 0, radius, tight)
@@ -78,7 +81,8 @@ def _extents(curve: Curve, radius: jax.Array | float) -> list[jax.Array]:
 
 
 def cut(curve: Curve, fraction: jax.Array, radius: jax.Array | float) -> Curve:
-    """The first fraction (...) of curves, of their :func:`extent`."""
+    """The first fraction (...) of curves, measured by their :func:`extent`."""
+    # Piece by piece: drive it as far as what is left of the extent allows.
     left, drives = fraction * extent(curve, radius), []
     for drive, size in zip(curve.drive, _extents(curve, radius), strict=True):
         drives.append(drive * jnp.clip(left / jnp.maximum(size, 1e-12), 0.0, 1.0))
@@ -99,24 +103,15 @@ def follow(a: jax.Array, curve: Curve, radius: jax.Array | float) -> jax.Array:
     return jnp.stack([x, y, heading], axis=-1)
 
 
-def interpolate(
-    a: jax.Array, b: jax.Array, fraction: jax.Array | float, radius: jax.Array | float
-) -> jax.Array:
-    """Poses (..., 3) at a fraction (...) of the shortest paths, as :func:`cut` has it.
-
-    Headings are in [-pi, pi).
-    """
-    pose = follow(a, cut(shortest(a, b, radius), jnp.asarray(fraction), radius), radius)
-    return pose.at[..., 2].set(_wrap(pose[..., 2]))
-
-
 def _goal_in_start(a: jax.Array, b: jax.Array, radius: jax.Array | float) -> tuple:
+    """The goals' x, y and heading (...) in the frames of the starts; lengths in radii."""
     dx, dy = (b[..., 0] - a[..., 0]) / radius, (b[..., 1] - a[..., 1]) / radius
     c, s = jnp.cos(a[..., 2]), jnp.sin(a[..., 2])
     return c * dx + s * dy, c * dy - s * dx, b[..., 2] - a[..., 2]
 
 
 def _wrap(angle: jax.Array) -> jax.Array:
+    """The same angles in [-pi, pi)."""
     return angle - 2 * jnp.pi * jnp.floor((angle + jnp.pi) / (2 * jnp.pi))
 
 
@@ -132,6 +127,7 @@ def _candidates(goal: tuple) -> tuple[jax.Array, ...]:
     x, y, phi = goal
     c, s = jnp.cos(phi), jnp.sin(phi)
     seen_from_goal = (x * c + y * s, x * s - y * c)
+    # Each word in its four mirror images at once, along the first axis.
     found = []
     for formula, from_goal, *_ in _WORDS:
         wx, wy = seen_from_goal if from_goal else (x, y)
@@ -140,8 +136,9 @@ def _candidates(goal: tuple) -> tuple[jax.Array, ...]:
     return tuple(jnp.concatenate(column) for column in zip(*found, strict=True))
 
 
-# The formulas, numbered as in the paper: from the goal's pose (x, y, phi) with the cosine and sine
-# of phi to the length and the three free numbers of the word, or to infinity.
+# The formulas, numbered as in the paper. From the goal's pose (x, y, phi), with the cosine and sine
+# of phi, they compute the length of the word and its three free numbers t, u and v. The length is
+# infinite where the word cannot reach the goal.
 
 
 def _left_straight_left(x, y, phi, c, s):  # 8.1
@@ -210,7 +207,7 @@ def _left_right_straight_left_right(x, y, phi, c, s):  # 8.11
 
 
 def _outer_turns(u, v, xi, eta, phi):
-    """The first and the last turn around two inner ones."""
+    """The first and the last turn of a word whose two inner turns are given."""
     delta = u - v
     a, b = jnp.sin(u) - jnp.sin(delta), jnp.cos(u) - jnp.cos(delta) - 1
     angle = jnp.arctan2(eta * a - xi * b, xi * a + eta * b)

@@ -1,4 +1,4 @@
-"""The samplers as planners use them, with random weights; and scores of waypoints."""
+"""The samplers as planners use them, with random weights."""
 
 import dataclasses
 
@@ -9,13 +9,10 @@ import pytest
 from nrp_synthetic import free, random_grid
 
 from nrp_jax import samplers
-from nrp_jax.bench import score
-from nrp_jax.homes.grid import Grid
-from nrp_jax.learning.batches import make_batch, make_examples
+from nrp_jax.learning.batches import empty_batch, make_examples
 from nrp_jax.learning.checkpoint import Model, build_module, save_model
-from nrp_jax.learning.expert import build_roadmap
 from nrp_jax.learning.models import ModelConfig
-from nrp_jax.learning.train import init
+from nrp_jax.learning.objective import init
 from nrp_jax.scene.robots import load_robot
 from nrp_jax.scene.world import build_world, with_grid
 
@@ -26,7 +23,7 @@ def random_model(kind: str, seed: int = 0) -> Model:
     rows = {"q_start": q, "q_goal": q, "waypoint": q, "home": np.zeros(1), "query": np.zeros(1)}
     grid = random_grid(0)
     examples = make_examples(config, robot, [grid], rows, target=np.ones(1), weight=np.ones(1))
-    batch = make_batch(config, robot, examples, jnp.zeros(1, jnp.int32))
+    batch = empty_batch(config, robot, examples)
     outputs = batch.waypoints.shape[-1]
     variables = init(config, build_module(config, outputs), batch, jax.random.key(seed))
     return Model(config=config, variables=variables, info={"num_outputs": outputs})
@@ -72,8 +69,9 @@ def test_waypoints_are_near_and_inside_the_limits(kind, models, world, ends):
 
 
 def test_checking_finds_waypoints_that_can_be_reached(models, world, ends):
-    def reached(checked):
-        sampler = samplers.make_sampler(models["discriminator"], candidates=64, checked=checked)
+    def reached(num_edge_checked):
+        settings = {"candidates": 64, "num_edge_checked": num_edge_checked}
+        sampler = samplers.make_sampler(models["discriminator"], **settings)
         q = np.asarray(samplers.propose(sampler, world, *ends, jax.random.key(3)))
         fraction = np.linspace(0, 1, 24)[:, None, None]
         edge = np.asarray(ends[0]) + fraction * np.asarray(world.edge(ends[0], q))
@@ -99,54 +97,6 @@ def test_weights_of_another_task_or_kind_are_refused(models, tmp_path):
         samplers.load_sampler("snake", "discriminator", tmp_path)
     with pytest.raises(ValueError, match="unknown task 'panda'"):
         samplers.load_sampler("panda", "cvae")
-    assert samplers.load_sampler("snake", "cvae", tmp_path, checked=4).checked == 4
-
-
-def test_maps_that_do_not_fit_are_left_out(tmp_path, capsys):
-    for name, layers, z in (
-        ("a/map", 20, 0.02),
-        ("b/map", 20, 0.0),
-        ("flat", 1, 0.0),
-        ("high", 20, 0.1),
-        ("low", 19, 0.0),
-    ):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        grid = Grid(occupied=np.zeros((9, 9, layers)), origin=(3.0, -2.0, z))
-        grid.save(tmp_path / f"{name}.npz")
-    tested = {"cvae": samplers.load_sampler("fetch", "cvae")}
-    maps = score._maps(tmp_path, load_robot("fetch"), tested)
-    assert [*maps] == ["a/map.npz", "b/map.npz"]
-    assert maps["a/map.npz"].origin == (0.0, 0.0, 0.02)
-    told = capsys.readouterr().err.splitlines()
-    assert [line.split("'")[1].split("/")[-1] for line in told] == [
-        "flat.npz",
-        "high.npz",
-        "low.npz",
-    ]
-    assert "samplers have seen 20" in told[2] and "begin at z = 0.1 m" in told[1]
-    with pytest.raises(ValueError, match="no maps for fetch in .*; expected .npz"):
-        score._maps(tmp_path / "none", load_robot("fetch"), tested)
-
-
-def test_scores_of_waypoints(world):
-    """The expert's own waypoint scores 1, one behind a wall 0, one off the way in between."""
-    robot = load_robot("snake")
-    roadmap = build_roadmap(world, robot, jax.random.key(0), 500)
-    queries = score.make_queries(world, robot, roadmap, 20, seed=0)
-    best = np.array(
-        [
-            np.argmin(np.where(row > 0, row + queries.cost[goal], np.inf))
-            for row, goal in zip(
-                roadmap.lengths[queries.start].toarray(), queries.goal, strict=True
-            )
-        ]
+    assert (
+        samplers.load_sampler("snake", "cvae", tmp_path, num_edge_checked=4).num_edge_checked == 4
     )
-    expert = score.optimality(world, robot, roadmap, queries, roadmap.q[best])
-    np.testing.assert_allclose(expert, 1.0, atol=1e-3)
-    blocked = roadmap.q[best].copy()
-    blocked[:, :2] = -1.0
-    np.testing.assert_array_equal(score.optimality(world, robot, roadmap, queries, blocked), 0.0)
-    rng = np.random.default_rng(0)
-    aside = roadmap.q[queries.start] + rng.uniform(-0.3, 0.3, (20, 8)).astype(np.float32)
-    scores = score.optimality(world, robot, roadmap, queries, aside)
-    assert (scores <= 1).all() and 0 < np.median(scores) < 1

@@ -1,6 +1,7 @@
 """Training on a small data set with a real rule behind it."""
 
 import csv
+import dataclasses
 import os
 import signal
 import subprocess
@@ -20,6 +21,11 @@ from nrp_jax.learning.models import ModelConfig
 from nrp_jax.learning.train import TrainConfig, check_settings, split_by_home, train
 
 SETTINGS = TrainConfig(epochs=16, batch=48, patience=16)
+SMALL = {"channels": (16, 32), "context": 64, "width": 32}  # networks that train in seconds
+
+
+def small_config(kind):
+    return dataclasses.replace(ModelConfig.default("snake", kind), **SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +66,7 @@ def test_homes_are_held_out_whole():
 
 def test_the_discriminator_learns_and_goes_on_after_a_kill(rows, tmp_path, monkeypatch, capsys):
     """It learns what is free in unseen homes; a killed run ends as an unbroken one."""
-    config = ModelConfig.default("snake", "discriminator")
+    config = small_config("discriminator")
     robot, examples = examples_of(config, rows)
     model = train(config, robot, examples, tmp_path / "a", settings=SETTINGS, progress=False)
     assert model.info["best"]["quality"] > 0.85
@@ -101,7 +107,7 @@ def test_the_discriminator_learns_and_goes_on_after_a_kill(rows, tmp_path, monke
 
 
 def test_a_diverged_training_keeps_the_best_epoch(rows, tmp_path, monkeypatch):
-    config = ModelConfig.default("snake", "discriminator")
+    config = small_config("discriminator")
     robot, examples = examples_of(config, rows)
     losses = iter([0.5, 0.4, np.nan])
     monkeypatch.setattr(training, "validate", lambda *_: {"loss": next(losses), "quality": 0.5})
@@ -113,10 +119,12 @@ def test_a_diverged_training_keeps_the_best_epoch(rows, tmp_path, monkeypatch):
 
 
 def test_the_generator_learns(rows, tmp_path):
-    config = ModelConfig.default("snake", "cvae")
+    config = dataclasses.replace(small_config("cvae"), context=96, width=96)
     robot, examples = examples_of(config, rows)
-    model = train(config, robot, examples, tmp_path, settings=SETTINGS, progress=False)
-    batch = make_batch(config, robot, examples, np.arange(len(examples.home)))
+    settings = dataclasses.replace(SETTINGS, epochs=24, learning_rate=8e-3)
+    model = train(config, robot, examples, tmp_path, settings=settings, progress=False)
+    compiled = jax.jit(make_batch, static_argnums=0)
+    batch = compiled(config, robot, examples, np.arange(len(examples.home)))
     spread = np.asarray(batch.waypoints)[np.asarray(batch.weight) > 0].var(axis=0).mean()
     assert -model.info["best"]["quality"] < 0.9 * spread
 
@@ -133,6 +141,6 @@ def test_settings_and_data_of_another_task_are_refused():
 
 
 if __name__ == "__main__":
-    config = ModelConfig.default("snake", "discriminator")
+    config = small_config("discriminator")
     found = examples_of(config, synthetic_rows(homes=6, queries=80, waypoints=6))
     train(config, *found, Path(sys.argv[1]), settings=SETTINGS, progress=False)

@@ -21,6 +21,12 @@ from vrrt_jax.core.planners.rrt import sample_configurations
 MAPS = Path(os.environ.get("NRP_MAPS", "maps-are-elsewhere"))
 
 
+# One compiled program each: operation by operation, curves of the Fetch take seconds.
+interpolate = jax.jit(lambda world, q_a, q_b, fraction: world.interpolate(q_a, q_b, fraction))
+distance = jax.jit(lambda world, q_a, q_b: world.distance(q_a, q_b))
+span = jax.jit(lambda world, q_a, q_b: world.span(world.edge(q_a, q_b)))
+
+
 def cluttered(rng, shape, share=0.04):
     occupied = rng.random(shape) < share
     occupied[2:5, 2:5] = False
@@ -51,7 +57,7 @@ def distance_to_cells(grid, points):
 
 
 @pytest.mark.parametrize("name", ["snake", "fetch"])
-def test_room_is_a_close_lower_bound(worlds, rng, name):
+def test_the_clearance_bound_is_a_close_lower_bound(worlds, rng, name):
     _, grid, _ = worlds[name]
     low, high = np.array(grid.origin), grid.origin + grid.size
     points = rng.uniform(low - 0.2, high + 0.2, (4000, 3))
@@ -135,33 +141,33 @@ def test_another_home_does_not_compile_again(worlds):
 def test_edges_and_metric(worlds, name):
     robot, _, world = worlds[name]
     q_a, q_b = sample_configurations(world, jax.random.key(2), 64).reshape(2, 32, -1)
-    np.testing.assert_allclose(world.distance(q_a, q_b), world.distance(q_b, q_a), rtol=1e-4)
+    np.testing.assert_allclose(distance(world, q_a, q_b), distance(world, q_b, q_a), rtol=1e-4)
     if name == "snake":
         step = np.array(q_b - q_a)
         step[:, 2] = (step[:, 2] + np.pi) % (2 * np.pi) - np.pi  # q1 alone is_continuous
         base, arm = np.linalg.norm(step[:, :2], axis=1), np.linalg.norm(step[:, 2:], axis=1)
-        np.testing.assert_allclose(world.distance(q_a, q_b), base + 0.167 * arm, rtol=1e-4)
-    ends = [world.interpolate(q_a, q_b, f) for f in (0.0, 1.0)]
+        np.testing.assert_allclose(distance(world, q_a, q_b), base + 0.167 * arm, rtol=1e-4)
+    ends = [interpolate(world, q_a, q_b, f) for f in (0.0, 1.0)]
     for end, q in zip(ends, (q_a, q_b), strict=True):
         apart = np.array(end - q)
         is_continuous = np.asarray(world.is_continuous)
         apart[:, is_continuous] = (apart[:, is_continuous] + np.pi) % (2 * np.pi) - np.pi
         assert np.abs(apart).max() < 1e-3
-    middle = world.interpolate(q_a, q_b, 0.5)
-    first, second = world.distance(q_a, middle), world.distance(middle, q_b)
-    np.testing.assert_allclose(first + second, world.distance(q_a, q_b), atol=0.01)
+    middle = interpolate(world, q_a, q_b, 0.5)
+    first, second = distance(world, q_a, middle), distance(world, middle, q_b)
+    np.testing.assert_allclose(first + second, distance(world, q_a, q_b), atol=0.01)
     if name == "snake":  # the Fetch's edges are cut by how far they go or turn
-        np.testing.assert_allclose(first, world.distance(q_a, q_b) / 2, atol=0.01)
+        np.testing.assert_allclose(first, distance(world, q_a, q_b) / 2, atol=0.01)
 
 
 @pytest.mark.parametrize("name", ["snake", "fetch"])
 def test_no_joint_moves_farther_in_a_sub_step_than_the_resolution(worlds, name):
     _, _, world = worlds[name]
     q_a, q_b = sample_configurations(world, jax.random.key(5), 64).reshape(2, 32, -1)
-    num = np.ceil(np.asarray(world.span(world.edge(q_a, q_b))) / float(world.resolution))
+    num = np.ceil(np.asarray(span(world, q_a, q_b)) / float(world.resolution))
     for start, end, parts in zip(q_a, q_b, num.astype(int), strict=True):
         fraction = np.minimum(np.arange(200) / parts, 1.0).astype(np.float32)
-        step = np.diff(world.interpolate(start[None], end[None], fraction), axis=0)
+        step = np.diff(interpolate(world, start[None], end[None], fraction), axis=0)
         is_continuous = np.asarray(world.is_continuous)
         step[:, is_continuous] = (step[:, is_continuous] + np.pi) % (2 * np.pi) - np.pi
         assert np.abs(step).max() <= 1.01 * float(world.resolution)
@@ -174,7 +180,7 @@ def test_distances_to_nodes_agree_with_the_metric(worlds, name):
     nodes = sample_configurations(world, jax.random.key(3), 300)
     q = sample_configurations(world, jax.random.key(4), 20)
     among = jnp.ones((20, 300), bool).at[:, ::7].set(False)
-    exact = np.asarray(world.distance(q[:, None], nodes))
+    exact = np.asarray(distance(world, q[:, None], nodes))
     found = np.asarray(jax.jit(lambda w, *a: w.distances(*a))(world, nodes, q, among))
     assert np.all(np.isinf(found[:, ::7]))
     answered = np.isfinite(found)
@@ -192,7 +198,7 @@ def test_free_steps_against_single_checks(worlds):
         jax.jit(free_prefix, static_argnums=3)(world, q_from, world.edge(q_from, q_to), 64)
     )
     for a, b, count in zip(q_from, q_to, passed, strict=True):
-        points = world.interpolate(a[None], b[None], jnp.arange(1, 65) / 64)
+        points = interpolate(world, a[None], b[None], jnp.arange(1, 65) / 64)
         free = np.asarray(nrp_jax.batch_is_free(world, points))
         assert count == (64 if free.all() else np.argmin(free))
 
