@@ -206,4 +206,4 @@ def _windowed(
     ]
     if any(windows is None for _, windows in found):
         return splats, None
-    return max(found, key=lambda pair: pair[1].px if pair[1] is not None else 0)
+    return max(found, key=lambda pair: pair[1].size_px if pair[1] is not None else 0)
