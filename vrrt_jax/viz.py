@@ -25,13 +25,16 @@ from vrrt_jax.splat.raster import render
 from vrrt_jax.splat.types import Camera, SplatModel
 
 SKY = np.array([0.97, 0.98, 1.0])
+MARCHING_STEPS = 60  # along each ray
+HIT_M = 5e-3  # [m] a ray that comes so near to a surface hits it
+FARTHEST_M = 30.0  # [m] depth up to which obstacles are drawn
 
 
 class ScenePainter:
-    """Pictures of robot and obstacles: MuJoCo's where it can, else splats over drawn obstacles."""
+    """Pictures of robot and obstacles: MuJoCo's if it can, or splats over ray-marched obstacles."""
 
     def __init__(self, robot: Robot, world: World, self_model: SelfModel, camera: Camera):
-        """Look for the robot's meshes and OpenGL; ``uses_meshes`` says what was found."""
+        """Choose how to draw; ``uses_meshes`` says whether the true meshes are drawn."""
         self._camera, self._chain = camera, robot.chain
         self._meshes = _mesh_renderer(robot, world)
         self.uses_meshes = self._meshes is not None
@@ -41,7 +44,7 @@ class ScenePainter:
             self._robot = jax.jit(lambda q: _splat_layers(splats, robot, camera, q))
 
     def paint(self, q: np.ndarray) -> np.ndarray:
-        """The scene at ``q``: (H, W, 3) uint8."""
+        """The scene at a configuration (D,) [rad] or [m]: (H, W, 3) uint8."""
         if self._meshes is not None:
             return self._meshes.scene(q, self._camera)
         rgb, alpha, depth = (np.asarray(x) for x in self._robot(jnp.asarray(q, jnp.float32)))
@@ -53,6 +56,7 @@ class ScenePainter:
 
 
 def _mesh_renderer(robot: Robot, world: World) -> Any:
+    """MuJoCo's renderer, or None without meshes or OpenGL."""
     from vrrt_jax.splat.mujoco_images import MeshRenderer
 
     try:
@@ -63,16 +67,17 @@ def _mesh_renderer(robot: Robot, world: World) -> Any:
         renderer.check()
         return renderer
     except (RuntimeError, OSError, ValueError):
-        return None  # no OpenGL, or no meshes to be had: splats are drawn instead
+        return None
 
 
 def _splat_layers(splats: SplatModel, robot: Robot, camera: Camera, q: jax.Array):
-    """Color over black, alpha and depth of the robot."""
+    """Color over black (H, W, 3), alpha (H, W) and depth (H, W) [m] of the robot."""
     poses = link_poses(robot.chain, q)
     rgb, alpha = render(splats, poses, camera)
     pose = poses[splats.link]
     points = jnp.einsum("gij,gj->gi", pose[:, :3, :3], splats.mean) + pose[:, :3, 3]
     _, depth = project(camera, points)
+    # The depth is rendered like a color.
     depth_as_rgb = dataclasses.replace(
         splats,
         rgb=jnp.repeat(depth[:, None], 3, axis=1),
@@ -83,46 +88,62 @@ def _splat_layers(splats: SplatModel, robot: Robot, camera: Camera, q: jax.Array
 
 
 def _draw_obstacles(world: World, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Sphere-trace the obstacles: color (H, W, 3) and depth (H, W), +inf where there is none."""
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    center, focal = np.asarray(camera.principal_point), float(camera.focal)
-    in_cam = np.stack([(x - center[0]) / focal, (y - center[1]) / focal, np.ones_like(x)], -1)
-    rotation = np.asarray(camera.world_to_cam[:3, :3])
-    eye = jnp.asarray(-rotation.T @ np.asarray(camera.world_to_cam[:3, 3]))
-    rays = jnp.asarray((in_cam.reshape(-1, 3) @ rotation).T, jnp.float32)  # depth 1 along the axis
-    stretch = jnp.sqrt(jnp.sum(rays**2, axis=0))
+    """Draw the obstacles by ray marching their signed distances.
+
+    Returns:
+        Color (H, W, 3), and depth (H, W) [m], +inf where no obstacle is hit.
+    """
+    eye, rays = _pixel_rays(camera)
+    stretch = jnp.sqrt(jnp.sum(rays**2, axis=0))  # [m] along the ray per meter of depth
 
     @jax.jit
     def trace(rays, stretch):
-        def nearest(depth):
+        def distances(depth):
             return signed_distances(world.obstacles, eye[:, None] + depth * rays)
 
+        # The nearest surface is at least its distance away, so a step of that length is safe.
         depth = jax.lax.fori_loop(
-            0, 60, lambda _, d: d + jnp.min(nearest(d), axis=1) / stretch, jnp.zeros_like(stretch)
+            0,
+            MARCHING_STEPS,
+            lambda _, d: d + jnp.min(distances(d), axis=1) / stretch,
+            jnp.zeros_like(stretch),
         )
-        point = eye[:, None] + depth * rays
-        surface = nearest(depth)
+        point, distance = eye[:, None] + depth * rays, distances(depth)
+        hit = (jnp.min(distance, axis=1) < HIT_M) & (depth < FARTHEST_M)
+        # The gradient of the distance is the surface's normal.
         normal = jax.grad(lambda p: jnp.sum(jnp.min(signed_distances(world.obstacles, p), axis=1)))(
             point
         )
-        hit = (jnp.min(surface, axis=1) < 5e-3) & (depth < 30.0)
         facing = jnp.abs(jnp.sum(normal * rays, axis=0)) / stretch
-        return depth, hit, jnp.argmin(surface, axis=1), facing
+        return depth, hit, jnp.argmin(distance, axis=1), facing
 
-    depth, hit, which, facing = (np.asarray(a) for a in trace(rays, stretch))
+    depth, hit, nearest, facing = (np.asarray(a) for a in trace(rays, stretch))
+    # A lamp on the camera: surfaces that face it are brighter.
     palette = np.array([list(c[:3]) if c else [0.5, 0.5, 0.5] for c in world.colors])
-    color = palette[which] * (0.45 + 0.55 * facing[:, None])
+    color = palette[nearest] * (0.45 + 0.55 * facing[:, None])
     color = np.where(hit[:, None], color, SKY)
     shape = (camera.height, camera.width)
     return color.reshape(*shape, 3), np.where(hit, depth, np.inf).reshape(shape)
 
 
+def _pixel_rays(camera: Camera) -> tuple[jax.Array, jax.Array]:
+    """The camera's center (3,), and rays (3, H * W) in the world with a depth of 1 [m]."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    center, focal = np.asarray(camera.principal_point), float(camera.focal)
+    in_cam = np.stack([(x - center[0]) / focal, (y - center[1]) / focal, np.ones_like(x)], -1)
+    rotation = np.asarray(camera.world_to_cam[:3, :3])
+    eye = jnp.asarray(-rotation.T @ np.asarray(camera.world_to_cam[:3, 3]))
+    return eye, jnp.asarray((in_cam.reshape(-1, 3) @ rotation).T, jnp.float32)
+
+
 def along(world: World, path: np.ndarray, num: int) -> np.ndarray:
     """``num`` configurations at equal distances along a path (P, D)."""
     path = np.asarray(path, np.float32)
+    # Length of the path up to each point; continuous joints take the shorter direction.
     step = np.asarray(difference(world, jnp.asarray(path[:-1]), jnp.asarray(path[1:])))
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(step, axis=1))])
     at = np.linspace(0.0, length[-1], num)
+    # The segment that holds each length, and how far along the segment it is.
     index = np.clip(np.searchsorted(length, at, side="right") - 1, 0, max(len(step) - 1, 0))
     if len(step) == 0 or length[-1] == 0:
         return np.repeat(path[:1], num, axis=0)
@@ -140,19 +161,20 @@ def save_animation(
         result: its plan.
         path: of the ``.gif``.
         height: of the picture [px].
-        frames: of the motion.
+        frames: number of pictures.
 
     Returns:
         Whether the robot is drawn with its true meshes.
     """
     camera = shrunk(problem.cameras[0], max(1, round(problem.cameras[0].height / height)))
     painter = ScenePainter(problem.robot, problem.world, problem.self_model, camera)
-    goal = _picture(problem.goal_images[0], (camera.width, camera.height))
-    rule = np.full((camera.height, 4, 3), 255, np.uint8)
+    goal = _over_sky(problem.goal_images[0], (camera.width, camera.height))
+    separator = np.full((camera.height, 4, 3), 255, np.uint8)
     pictures = [
-        Image.fromarray(np.concatenate([painter.paint(q), rule, goal], axis=1))
+        Image.fromarray(np.concatenate([painter.paint(q), separator, goal], axis=1))
         for q in along(problem.world, result.path, frames)
     ]
+    # The first and the last picture stay longer [ms].
     durations = [600, *[60] * (len(pictures) - 2), 1500]
     pictures[0].save(
         path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=True
@@ -160,7 +182,7 @@ def save_animation(
     return painter.uses_meshes
 
 
-def _picture(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def _over_sky(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """A goal image over the sky's color, resized: (H, W, 3) uint8."""
     image = np.asarray(image, np.float32)
     if image.shape[2] == 4:
@@ -170,7 +192,15 @@ def _picture(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def save_figure(problem: Problem, result: PlanResult, path: str | Path) -> None:
-    """Write a figure: start, goal image, rendered end and difference; loss; tree and path.
+    """Write a figure of a plan.
+
+    It shows the start, the goal image, the rendered end and their difference; the loss over the
+    iterations; and tree and path in two planes of joints.
+
+    Args:
+        problem: the problem.
+        result: its plan.
+        path: of the picture.
 
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
@@ -184,6 +214,7 @@ def save_figure(problem: Problem, result: PlanResult, path: str | Path) -> None:
     grid = figure.add_gridspec(2, 4, height_ratios=(1, 1.05))
     _draw_images(figure, grid, problem, result)
     _draw_loss(figure.add_subplot(grid[1, :2]), result)
+    # The planes of the four joints that move most; fewer joints repeat.
     names = problem.robot.joint_names
     spread = np.ptp(result.path, axis=0)
     order = np.argsort(-spread, kind="stable")
@@ -203,6 +234,7 @@ def save_figure(problem: Problem, result: PlanResult, path: str | Path) -> None:
 
 
 def _draw_images(figure, grid, problem: Problem, result: PlanResult) -> None:
+    """The upper row: start, goal image, rendered end, and difference."""
     camera = shrunk(problem.cameras[0], max(1, round(problem.cameras[0].height / 240)))
     goal, _ = prepare_goal([problem.goal_images[0]], [problem.cameras[0]], camera.height)
     painter = ScenePainter(problem.robot, problem.world, problem.self_model, camera)
@@ -214,7 +246,7 @@ def _draw_images(figure, grid, problem: Problem, result: PlanResult) -> None:
     panels = (
         ("start", painter.paint(result.path[0])),
         ("goal image", goal_rgb + SKY * (1 - goal_alpha[..., None])),
-        ("end, as the self-model sees it", rgb + SKY * (1 - alpha[..., None])),
+        ("end, drawn by the self-model", rgb + SKY * (1 - alpha[..., None])),
         ("difference", apart),
     )
     for column, (title, picture) in enumerate(panels):
@@ -228,6 +260,7 @@ def _draw_images(figure, grid, problem: Problem, result: PlanResult) -> None:
 
 
 def _draw_loss(axes, result: PlanResult) -> None:
+    """The best loss over the iterations, and the threshold of a match."""
     history = result.history
     axes.semilogy(history[:, 0], history[:, 2], color="tab:blue", label="best loss in the tree")
     axes.axhline(
@@ -240,8 +273,10 @@ def _draw_loss(axes, result: PlanResult) -> None:
 
 
 def _draw_tree(axes, result: PlanResult, joints: tuple[int, int], names: Sequence[str]) -> None:
+    """Tree and path in the plane of two joints."""
     from matplotlib.collections import LineCollection
 
+    # Edges from parents to children, colored by the child's loss.
     size = int(result.tree.size)
     q = np.asarray(result.tree.q)[:size][:, joints]
     parent = np.asarray(result.tree.parent)[:size]

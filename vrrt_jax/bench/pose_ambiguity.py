@@ -1,4 +1,7 @@
-"""What no image tells: a gripper that looks alike after half a turn of the last joint."""
+"""Poses that an image can hardly tell apart: the last joint turned by half a turn.
+
+The pose with the last joint turned is called the twin of a pose.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -19,22 +22,23 @@ from vrrt_jax.bench.tasks import (
 from vrrt_jax.core.edges import joint_error
 
 LEVELS = (0.5, 1.0, 1.5, 2.0, 2.5)  # distances from start to goal [rad]
-LOOKED_AT = 5  # tasks a level whose images are compared
+NUM_COMPARED = 5  # tasks of a level whose images are compared
 
 
 def run(tasks_per_level: int = 20, seed: int = 0) -> dict[str, Any]:
-    """How alike the true meshes look at a goal and at its twin, and which of them is nearer.
+    """Compare images of goals and of their twins, and their distances from the start.
 
-    A planner that cannot tell them apart had better take the one nearer to the start: that one is
-    the wrong one in ``twin_is_nearer`` of the tasks.
+    A planner that cannot tell a goal from its twin does best to take the one nearer to the start.
+    That one is wrong in a share ``twin_is_nearer`` of the tasks.
 
     Args:
-        tasks_per_level: of the visual benchmark.
+        tasks_per_level: number of tasks of the visual benchmark at each distance.
         seed: of the tasks.
 
     Returns:
-        For each robot: by level the median PSNR of the two [dB] over a few tasks, and the share of
-        all tasks whose twin is within the limits and nearer to the start.
+        For each robot and distance: the median PSNR between the images of a goal and its twin [dB],
+        over a few tasks; and the share of all tasks whose twin is within the limits and nearer to
+        the start.
     """
     found = {}
     for robot in ROBOTS:
@@ -48,7 +52,7 @@ def run(tasks_per_level: int = 20, seed: int = 0) -> dict[str, Any]:
                     "distance_rad": level,
                     "n": len(tasks),
                     "psnr_db": float(
-                        np.median([_alike(robot, task) for task in tasks[:LOOKED_AT]])
+                        np.median([_psnr_db(robot, task) for task in tasks[:NUM_COMPARED]])
                     ),
                     "twin_is_nearer": float(np.mean([_is_nearer(robot, t) for t in tasks])),
                 }
@@ -64,22 +68,26 @@ def twin(robot: str, task: Task) -> Task:
     return dataclasses.replace(task, q_goal=q_goal)
 
 
-def _alike(robot: str, task: Task) -> float:
+def _psnr_db(robot: str, task: Task) -> float:
+    """PSNR between the images of a task's goal and of its twin [dB]."""
     images, _ = goal_images(robot, task, Scenery())
     return image_psnr(robot, twin(robot, task).q_goal, images, Scenery())
 
 
 def _is_nearer(robot_name: str, task: Task) -> bool:
+    """Whether the twin is within the limits, and nearer to the start than the goal."""
     robot, world = bench_robot(robot_name), bench_world(robot_name, task.world)
     q = twin(robot_name, task).q_goal
     if np.any(~robot.is_continuous & ((q < robot.lower) | (q > robot.upper))):
         return False
-    away, truly = (np.linalg.norm(joint_error(world, e, task.q_start)) for e in (q, task.q_goal))
-    return bool(away < truly)
+    to_twin, to_goal = (
+        np.linalg.norm(joint_error(world, end, task.q_start)) for end in (q, task.q_goal)
+    )
+    return bool(to_twin < to_goal)
 
 
 def draw(path: str | Path, level: float = 2.5, seed: int = 0) -> None:
-    """Write a figure of a goal of each robot, its twin, and where they differ."""
+    """Write a figure: a goal of each robot, its twin, and where their images differ."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -103,7 +111,7 @@ def draw(path: str | Path, level: float = 2.5, seed: int = 0) -> None:
 
 
 def _around(mask: np.ndarray, margin: int = 15) -> tuple[slice, slice]:
-    """A square window around what a mask (H, W) shows."""
+    """Rows and columns of a square around what a mask (H, W) shows."""
     low, high = (f(np.argwhere(mask), axis=0) for f in (np.min, np.max))
     half, center = int(np.max(high - low)) // 2 + margin, (low + high) // 2
     first = np.maximum(center - half, 0)

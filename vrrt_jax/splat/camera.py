@@ -19,7 +19,7 @@ def look_at(
     width: int = 480,
     up: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> Camera:
-    """Place a camera at ``eye`` that looks at ``target``.
+    """Place a camera at ``eye`` that points at ``target``.
 
     Args:
         eye: camera center in the world [m].
@@ -29,11 +29,15 @@ def look_at(
         width: image width [px].
         up: direction that points up in the image.
 
+    Returns:
+        The camera; its principal point is the middle of the image.
+
     Raises:
         ValueError: the eye is at the target, or the view direction is parallel to ``up``.
     """
     eye_, target_, up_ = (np.asarray(v, np.float64) for v in (eye, target, up))
     forward = target_ - eye_
+    # The rows of the rotation are the camera's axes: right, down, forward.
     right = np.cross(forward, up_)
     if np.linalg.norm(right) < 1e-9:
         raise ValueError(
@@ -45,6 +49,7 @@ def look_at(
     world_to_cam = np.eye(4)
     world_to_cam[:3, :3] = rotation
     world_to_cam[:3, 3] = -rotation @ eye_
+    # Half the image's height spans half the field of view.
     focal = 0.5 * height / np.tan(np.radians(fovy_deg) / 2)
     return camera_from_matrix(world_to_cam, focal=float(focal), height=height, width=width)
 
@@ -57,10 +62,10 @@ def camera_from_matrix(
     width: int,
     principal_point: Sequence[float] | None = None,
 ) -> Camera:
-    """A calibrated camera.
+    """Make a camera from its calibration.
 
     Args:
-        world_to_cam: (4, 4) rigid transform; the camera looks along +z, x right, y down.
+        world_to_cam: (4, 4) rigid transform; the camera points along +z, with x right and y down.
         focal: focal length [px].
         height: image height [px].
         width: image width [px].
@@ -102,10 +107,10 @@ def orbit(
     """Place a camera by angles around ``target``, as MuJoCo's free camera does.
 
     Args:
-        azimuth_deg: heading of the view direction about z [degree]; at 0 the camera looks along +x.
-        elevation_deg: pitch of the view direction [degree]; negative looks down.
-        distance: from the target [m].
-        target: the point looked at [m].
+        azimuth_deg: heading of the view direction about z [degree]; 0 is along +x.
+        elevation_deg: pitch of the view direction [degree]; negative is downwards.
+        distance: from the camera to the target [m].
+        target: the point (3,) in the middle of the image [m].
         fovy_deg: vertical field of view [degree].
         height: image height [px].
         width: image width [px].
@@ -123,7 +128,7 @@ def orbit(
 
 
 def shrunk(camera: Camera, factor: int) -> Camera:
-    """The same view with blocks of ``factor`` x ``factor`` pixels made one; rounds the size up."""
+    """The same view with blocks of ``factor`` x ``factor`` pixels as one; rounds the size up."""
     return dataclasses.replace(
         camera,
         focal=camera.focal / factor,
@@ -134,7 +139,14 @@ def shrunk(camera: Camera, factor: int) -> Camera:
 
 
 def cut(camera: Camera, corner: np.ndarray, height: int, width: int) -> Camera:
-    """A part of the same view, whose upper left corner (..., 2) is at x, y [px]."""
+    """A part of the same view.
+
+    Args:
+        camera: the whole view.
+        corner: (..., 2) upper left corner of the part, x, y [px].
+        height: of the part [px].
+        width: of the part [px].
+    """
     return dataclasses.replace(
         camera, principal_point=camera.principal_point - corner, height=height, width=width
     )
@@ -146,10 +158,17 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
 
 
 def project(camera: Camera, points_world: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Project points (..., 3) to pixels (..., 2) and depths (...) [m].
+    """Project points to pixels.
 
-    Points nearer than 1 cm, or behind the camera, get a pixel that is finite but meaningless: look
-    at the depth.
+    Points nearer than 1 cm, or behind the camera, get a pixel that is finite but meaningless. Their
+    depth tells.
+
+    Args:
+        camera: the view.
+        points_world: (..., 3) [m].
+
+    Returns:
+        Pixels (..., 2) x, y, and depths (...) along the optical axis [m].
     """
     points_cam = points_world @ camera.world_to_cam[:3, :3].T + camera.world_to_cam[:3, 3]
     depth = points_cam[..., 2]

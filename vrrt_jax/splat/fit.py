@@ -27,6 +27,9 @@ from vrrt_jax.splat.training_images import (
     write_images,
 )
 
+# Images to train and to validate with, and surface points (m, 7).
+_Images = tuple[TrainingImages, TrainingImages, np.ndarray]
+
 
 def fit_self_model(
     robot, spec: mujoco.MjSpec, path: str | Path, *, seed: int, config: FitConfig
@@ -54,10 +57,13 @@ def fit_self_model(
     work = path.with_name(path.name + ".work")
     _claim(work, robot, seed, config)
 
-    def fit(images, level: LevelConfig, name: str) -> Level:
+    def fit(images: _Images, level: LevelConfig, name: str) -> Level:
+        train, held_out, points = images
         return fit_level(
             robot,
-            *images,
+            train,
+            held_out,
+            points,
             level,
             learning_rate=config.learning_rate,
             seed=seed,
@@ -117,9 +123,7 @@ def _claim(work: Path, robot, seed: int, config: FitConfig) -> None:
     file.write_text(stamp)
 
 
-def _cached_images(
-    robot, spec, config: FitConfig, work: Path, seed: int, tip
-) -> tuple[TrainingImages, TrainingImages, np.ndarray]:
+def _cached_images(robot, spec, config: FitConfig, work: Path, seed: int, tip) -> _Images:
     """Images for training and for validation, and surface points; close-ups if there is a tip."""
     kind = "whole" if tip is None else "close_up"
 

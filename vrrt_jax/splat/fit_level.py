@@ -125,8 +125,8 @@ def _training_step(
     return step
 
 
-def _batch(images: TrainingImages, rows: np.ndarray) -> tuple[Any, ...]:
-    """Configurations, cameras, colors and alphas of some images."""
+def _batch(images: TrainingImages, rows: np.ndarray | int) -> tuple[Any, ...]:
+    """Configurations, cameras, colors and alphas of some images, or of one."""
     return (
         jnp.asarray(images.q[rows], jnp.float32),
         jax.tree.map(lambda leaf: leaf[rows], images.cameras),

@@ -1,4 +1,4 @@
-"""Goal images: from a picture file or an array to what the loss compares with."""
+"""Goal images: read and write files, check arrays, and shrink them for the search."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,9 +12,10 @@ from vrrt_jax.splat.camera import cut, shrunk, stack_cameras
 from vrrt_jax.splat.types import Camera, GoalImage
 
 BACKGROUND_TOLERANCE = 0.06  # color difference that still counts as background
-OPAQUE = 0.99  # a fourth channel that is nowhere less is no mask
-MOST = 0.9  # of an image on a plain background can be robot
-KNOWN = 0.75  # share of a shrunk pixel that has to be valid, for its mean to stand for all of it
+MIN_OPAQUE = 0.99  # a fourth channel that is nowhere lower is no mask
+MIN_COVERED = 1e-4  # least share of an image that the robot has to cover
+MAX_COVERED = 0.9  # largest share of an image on a plain background that can be robot
+MIN_VALID = 0.75  # share of a shrunk pixel that has to be valid for its mean to stand for it
 
 
 def read_image(path: str | Path) -> np.ndarray:
@@ -39,10 +40,11 @@ def write_image(path: str | Path, rgb: np.ndarray, alpha: np.ndarray) -> None:
     """Write a goal image with its alpha as transparency: a PNG (H, W, 4).
 
     Args:
-        path: where to.
+        path: of the file.
         rgb: (H, W, 3) the robot over black, in [0, 1].
-        alpha: (H, W).
+        alpha: (H, W) share of each pixel that the robot covers, in [0, 1].
     """
+    # Files hold colors that are not multiplied by alpha.
     straight = rgb / np.maximum(alpha, 1e-3)[..., None]
     pixels = np.concatenate([np.clip(straight, 0, 1), alpha[..., None]], axis=-1)
     Image.fromarray(np.round(255 * pixels).astype(np.uint8), "RGBA").save(path)
@@ -57,16 +59,16 @@ def prepare_goal(
     """Check goal images and shrink them, with their cameras, to the size that is searched at.
 
     Args:
-        images: V arrays (H, W, 3) or (H, W, 4), uint8 or float in [0, 1]. The fourth channel is the
-            robot's alpha; without it, or where all of it is opaque, whatever differs from the
-            color that prevails on the border is taken to be robot.
+        images: V arrays (H, W, 3) or (H, W, 4), uint8 or float in [0, 1]. The fourth channel is
+            alpha, the share of a pixel that the robot covers. Without it, or if all of it is
+            opaque, a pixel is taken to be robot where it differs from the border's median color.
         cameras: V cameras of the images' sizes.
         image_px: wanted height; the images are reduced by the nearest whole factor.
-        masks: (H, W) bool, False where a pixel is unknown or occluded.
+        masks: V arrays (H, W) bool, False where a pixel is unknown or occluded; or None for each.
 
     Returns:
-        The goal (V, h, w, ...), whose ``valid`` is the share of a pixel that is, or 0 where that is
-        little; and the V cameras stacked.
+        The goal (V, h, w, ...), and the V cameras stacked. The goal's ``valid`` is the share of a
+        shrunk pixel that is valid, or 0 where the share is below 3/4.
 
     Raises:
         ValueError: what is wrong with an image, and what to do.
@@ -83,16 +85,17 @@ def prepare_goal(
         )
     views = []
     for image, camera, mask in zip(images, cameras, masks, strict=True):
-        rgb, alpha = _checked(np.asarray(image), camera)
-        valid = np.ones_like(alpha) if mask is None else _checked_mask(mask, camera)
+        rgb, alpha = _check_image(np.asarray(image), camera)
+        valid = np.ones_like(alpha) if mask is None else _check_mask(mask, camera)
+        # The mean of a block is over its valid pixels alone.
         factor = max(1, round(camera.height / image_px))
-        share = _blocks(valid, factor)
+        share = _block_means(valid, factor)
         known = np.maximum(share, 1e-6)
         views.append(
             (
-                _blocks(rgb * valid[..., None], factor) / known[..., None],
-                _blocks(alpha * valid, factor) / known,
-                np.where(share >= KNOWN, share, 0.0).astype(np.float32),
+                _block_means(rgb * valid[..., None], factor) / known[..., None],
+                _block_means(alpha * valid, factor) / known,
+                np.where(share >= MIN_VALID, share, 0.0).astype(np.float32),
                 shrunk(camera, factor),
             )
         )
@@ -109,13 +112,16 @@ def prepare_goal(
 def cut_goal(
     goal: GoalImage, cameras: Camera, middle: np.ndarray, px: int
 ) -> tuple[GoalImage, Camera]:
-    """A part of each of V goal images, and the cameras that see it alone.
+    """Cut a part out of each goal image, and out of its camera's view.
 
     Args:
         goal: whole images (V, H, W, ...).
-        cameras: V cameras of them.
-        middle: (V, 2) of the parts, x, y [px]; moved inwards at the border.
-        px: height and width of a part, or what the image has.
+        cameras: their V cameras.
+        middle: (V, 2) middles of the parts, x, y [px]; moved inwards at the border.
+        px: height and width of a part; at most the image's.
+
+    Returns:
+        The parts (V, px, px, ...), and the V cameras that see them.
     """
     size = np.minimum(px, [cameras.width, cameras.height])
     corner = np.clip(np.round(middle - size / 2), 0, [cameras.width, cameras.height] - size)
@@ -128,8 +134,21 @@ def cut_goal(
     return jax.tree.map(parts, goal), cut(cameras, corner, height, width)
 
 
-def _checked(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def _check_image(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """The robot over black (H, W, 3), and its alpha (H, W)."""
+    image = _check_pixels(image, camera)
+    has_mask = image.shape[2] == 4 and image[..., 3].min() < MIN_OPAQUE
+    alpha = image[..., 3] if has_mask else _alpha_on_plain_background(image)
+    if has_mask and alpha.mean() < MIN_COVERED:
+        raise ValueError(
+            "the goal image's mask (its fourth channel) is empty: no robot to match; check that "
+            "the mask is 1 on the robot"
+        )
+    return image[..., :3] * alpha[..., None], alpha
+
+
+def _check_pixels(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """The image as float32 (H, W, 3) or (H, W, 4) in [0, 1]."""
     if image.ndim != 3 or image.shape[2] not in (3, 4):
         raise ValueError(
             f"the goal image has shape {image.shape}; expected (height, width, 3) for RGB or "
@@ -153,31 +172,29 @@ def _checked(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]
             f"the goal image's values go from {image.min():.3g} to {image.max():.3g}; expected "
             "floats in [0, 1] or uint8"
         )
-    if image.shape[2] == 4 and image[..., 3].min() < OPAQUE:
-        alpha = image[..., 3]
-        if alpha.mean() < 1e-4:
-            raise ValueError(
-                "the goal image's mask (its fourth channel) is empty: no robot to match; check "
-                "that the mask is 1 on the robot"
-            )
-    else:
-        border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
-        apart = np.abs(image - np.median(border, axis=0))[..., :3].max(axis=-1)
-        alpha = (apart > BACKGROUND_TOLERANCE).astype(np.float32)
-        if alpha.mean() < 1e-4:
-            raise ValueError(
-                "the goal image is blank: every pixel has the color of the border; give an "
-                "image that shows the robot"
-            )
-        if alpha.mean() > MOST:
-            raise ValueError(
-                f"{100 * alpha.mean():.0f} % of the goal image differ from the color of its "
-                "border; expected a plain background, or the robot's mask as fourth channel"
-            )
-    return image[..., :3] * alpha[..., None], alpha
+    return image
 
 
-def _checked_mask(mask: np.ndarray, camera: Camera) -> np.ndarray:
+def _alpha_on_plain_background(image: np.ndarray) -> np.ndarray:
+    """Alpha (H, W), 1 where the image differs from the median color of its border."""
+    border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+    apart = np.abs(image - np.median(border, axis=0))[..., :3].max(axis=-1)
+    alpha = (apart > BACKGROUND_TOLERANCE).astype(np.float32)
+    if alpha.mean() < MIN_COVERED:
+        raise ValueError(
+            "the goal image is blank: every pixel has the color of the border; give an image that "
+            "shows the robot"
+        )
+    if alpha.mean() > MAX_COVERED:
+        raise ValueError(
+            f"{100 * alpha.mean():.0f} % of the goal image differ from the color of its border; "
+            "expected a plain background, or the robot's mask as fourth channel"
+        )
+    return alpha
+
+
+def _check_mask(mask: np.ndarray, camera: Camera) -> np.ndarray:
+    """The mask (H, W) as 0 and 1."""
     mask = np.asarray(mask)
     if mask.shape != (camera.height, camera.width):
         raise ValueError(
@@ -189,10 +206,10 @@ def _checked_mask(mask: np.ndarray, camera: Camera) -> np.ndarray:
     return mask.astype(bool).astype(np.float32)
 
 
-def _blocks(image: np.ndarray, factor: int) -> np.ndarray:
-    """Mean over blocks; what overhangs is padded with zeros, and so not valid."""
+def _block_means(image: np.ndarray, factor: int) -> np.ndarray:
+    """Means over blocks. Blocks that overhang are padded with zeros, which are not valid."""
     pad = [(0, -image.shape[axis] % factor) for axis in (0, 1)] + [(0, 0)] * (image.ndim - 2)
     image = np.pad(image, pad)
     height, width = image.shape[0] // factor, image.shape[1] // factor
-    cut = image.reshape(height, factor, width, factor, *image.shape[2:])
-    return cut.mean(axis=(1, 3)).astype(np.float32)
+    blocks = image.reshape(height, factor, width, factor, *image.shape[2:])
+    return blocks.mean(axis=(1, 3)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""How far a rendered robot is from a goal image."""
+"""The loss of a rendered robot against a goal image: a mean squared error."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,18 @@ def image_loss(
     goal_alpha: jax.Array,
     valid: jax.Array,
 ) -> jax.Array:
-    """Mean squared error () over the valid pixels and the four channels of one view."""
+    """Mean squared error of one view, over the valid pixels and the four channels.
+
+    Args:
+        rgb: (H, W, 3) the rendered robot over black.
+        alpha: (H, W) of the rendered robot.
+        goal_rgb: (H, W, 3) the goal over black.
+        goal_alpha: (H, W) of the goal.
+        valid: (H, W) weights of the pixels.
+
+    Returns:
+        ().
+    """
     error = jnp.sum((rgb - goal_rgb) ** 2, axis=-1) + (alpha - goal_alpha) ** 2
     return jnp.sum(valid * error) / (4.0 * jnp.maximum(jnp.sum(valid), 1.0))
 
@@ -29,8 +40,20 @@ def goal_loss(
     q: jax.Array,
     windows: Windows | None = None,
 ) -> jax.Array:
-    """Loss () of a configuration (D,): the mean over the V views."""
-    views = _views(chain, splats, cameras, q, windows)
+    """Loss of a configuration: the mean over the V views.
+
+    Args:
+        chain: the robot's kinematics.
+        splats: the robot's splats.
+        cameras: V cameras.
+        goal: V images.
+        q: (D,) the configuration [rad] or [m].
+        windows: to render with, if any.
+
+    Returns:
+        ().
+    """
+    views = _render_views(chain, splats, cameras, q, windows)
     losses = [
         image_loss(rgb, alpha, goal.rgb[view], goal.alpha[view], goal.valid[view])
         for view, (rgb, alpha) in enumerate(views)
@@ -38,7 +61,7 @@ def goal_loss(
     return jnp.mean(jnp.stack(losses))
 
 
-def _views(
+def _render_views(
     chain: Chain, splats: SplatModel, cameras: Camera, q: jax.Array, windows: Windows | None
 ) -> list[tuple[jax.Array, jax.Array]]:
     """Color and alpha in each of the V views."""
@@ -55,13 +78,17 @@ def weighted_image(
     q: jax.Array,
     windows: Windows | None = None,
 ) -> jax.Array:
-    """The image of a configuration (D,) as a vector (V * H * W * 4,).
+    """The image of a configuration, as a vector for least squares.
 
-    Its squared distance from :func:`weighted_goal` is the :func:`goal_loss`.
+    The squared distance between this vector and :func:`weighted_goal` is the :func:`goal_loss`.
+    Arguments are those of :func:`goal_loss`.
+
+    Returns:
+        (V * H * W * 4,) colors and alphas, times the root of each pixel's weight.
     """
     views = [
         jnp.concatenate([rgb, alpha[..., None]], axis=-1)
-        for rgb, alpha in _views(chain, splats, cameras, q, windows)
+        for rgb, alpha in _render_views(chain, splats, cameras, q, windows)
     ]
     return (jnp.stack(views) * _root_weight(goal)).ravel()
 
@@ -73,7 +100,7 @@ def weighted_goal(goal: GoalImage) -> jax.Array:
 
 
 def _root_weight(goal: GoalImage) -> jax.Array:
-    """(V, H, W, 1), whose squares are what a pixel counts in the mean over views."""
+    """(V, H, W, 1) root of each pixel's weight in the mean over views."""
     num_valid = jnp.maximum(jnp.sum(goal.valid, axis=(1, 2), keepdims=True), 1.0)
     return jnp.sqrt(goal.valid / (4.0 * num_valid * len(goal.valid)))[..., None]
 

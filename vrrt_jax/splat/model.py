@@ -14,7 +14,7 @@ from vrrt_jax.splat.types import SplatModel
 
 FORMAT = 3
 CLOSE_UP = "close_up"
-NEARLY = 1.125  # a level serves images so many times as high as those it was trained for
+MAX_ENLARGEMENT = 1.125  # a level serves images up to so many times its own height
 # Fields of the splats, and what the file calls them.
 ARRAYS = {
     "mean": "mean",
@@ -34,23 +34,25 @@ class Level:
     splats: SplatModel
     size_px: int  # image height that it was trained at [px]
     psnr_db: float  # on unseen poses and cameras, over RGB and alpha
-    match_threshold: float  # loss over covered share, under which 95 % of true poses lie
+    # The loss divided by the share of the image that the robot covers. 95 % of correct poses have a
+    # lower one.
+    match_threshold: float
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SelfModel:
-    """What a robot looks like, for :func:`vrrt_jax.plan`."""
+    """A robot's appearance, for :func:`vrrt_jax.plan`."""
 
     robot: str
     joint_names: tuple[str, ...]
     levels: tuple[Level, ...]  # by rising size
-    close_up: Level  # for a part of a larger image, around the outermost link
+    close_up: Level  # for a part of a larger image around the outermost link
     seed: int
     info: dict[str, Any]  # how it was trained: numbers of images, steps, seconds, versions
 
     def level_for(self, height_px: int) -> Level:
         """The coarsest level trained for images about this high or higher, or the finest."""
-        fitting = [level for level in self.levels if NEARLY * level.size_px >= height_px]
+        fitting = [level for level in self.levels if MAX_ENLARGEMENT * level.size_px >= height_px]
         return fitting[0] if fitting else self.levels[-1]
 
 
@@ -78,6 +80,7 @@ def save_self_model(model: SelfModel, path: str | Path) -> None:
     for name, level in named.items():
         for field, array in ARRAYS.items():
             value = np.asarray(getattr(level.splats, field))
+            # Half precision rounds a center by at most 0.25 mm within 1 m of its link's frame.
             small = np.uint8 if array == "link" else np.float16 if value.ndim else np.float32
             arrays[f"{name}/{array}"] = value.astype(small)
     with replacing(path) as file:

@@ -23,7 +23,7 @@ class Picture:
     """One rendered view."""
 
     rgb: np.ndarray  # (H, W, 3) float32, the robot over black
-    alpha: np.ndarray  # (H, W) float32
+    alpha: np.ndarray  # (H, W) float32, share of the pixel that the robot covers
     valid: np.ndarray  # (H, W) bool, False where an obstacle may hide the robot
 
 
@@ -34,7 +34,7 @@ class MeshRenderer:
 
     Args:
         spec: the robot with its visual meshes; it is compiled here.
-        obstacles: drawn too by :meth:`scene`, and in the way of :meth:`picture`.
+        obstacles: drawn by :meth:`scene`; in :meth:`picture` they only hide the robot.
         light: brightness of the lamp; 1 is what self-models are trained with.
     """
 
@@ -73,7 +73,16 @@ class MeshRenderer:
         self._renderer((8, 8))
 
     def picture(self, q: np.ndarray, camera: Camera) -> Picture:
-        """The robot alone over black, with its exact alpha; obstacles only hide it."""
+        """The robot alone over black, with its exact alpha; obstacles only hide it.
+
+        Args:
+            q: (D,) configuration [rad] or [m].
+            camera: the view; its size is the image's.
+
+        Raises:
+            ValueError: the image is too large.
+            RuntimeError: OpenGL is not available.
+        """
         scale = max(1, min(SUPERSAMPLING, MAX_RENDER_PX // max(camera.height, camera.width)))
         with self._drawing_obstacles():
             renderer = self._aim(q, camera, scale)
@@ -81,6 +90,7 @@ class MeshRenderer:
             renderer.enable_segmentation_rendering()
             segments = renderer.render()
             renderer.disable_segmentation_rendering()
+        # Group of the geom that each pixel shows; -1 for the background.
         is_geom = segments[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)
         group = np.append(self.model.geom_group, -1)[np.where(is_geom, segments[..., 0], -1)]
         mask = is_geom & (group != OBSTACLE_GROUP)
@@ -91,9 +101,14 @@ class MeshRenderer:
         )
 
     def surface(self, q: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Depth (H, W) [m] along the optical axis, and geom (H, W), -1 for none; no supersampling.
+        """Depths and geoms of the robot's surface, one sample a pixel.
 
-        Leaves ``data`` posed at ``q``.
+        Args:
+            q: (D,) configuration [rad] or [m].
+            camera: the view.
+
+        Returns:
+            Depth (H, W) along the optical axis [m], and geom (H, W), -1 for none.
         """
         renderer = self._aim(q, camera, 1)
         renderer.enable_depth_rendering()
@@ -106,8 +121,8 @@ class MeshRenderer:
         return depth, np.where(is_geom, segments[..., 0], -1)
 
     def scene(self, q: np.ndarray, camera: Camera) -> np.ndarray:
-        """Robot and obstacles for people to look at: (H, W, 3) uint8."""
-        scale = max(1, min(2, MAX_RENDER_PX // max(camera.height, camera.width)))
+        """Robot and obstacles, for people: (H, W, 3) uint8."""
+        scale = max(1, min(SUPERSAMPLING, MAX_RENDER_PX // max(camera.height, camera.width)))
         with self._drawing_obstacles():
             renderer = self._aim(q, camera, scale)
             image = renderer.render().astype(np.float32)
@@ -125,6 +140,7 @@ class MeshRenderer:
             self._option.geomgroup[OBSTACLE_GROUP] = 0
 
     def _aim(self, q: np.ndarray, camera: Camera, scale: int) -> mujoco.Renderer:
+        """A renderer with the robot posed and the camera placed, ``scale`` pixels per pixel."""
         renderer = self._renderer((camera.height * scale, camera.width * scale))
         self.data.qpos[:] = q
         mujoco.mj_kinematics(self.model, self.data)
@@ -134,6 +150,7 @@ class MeshRenderer:
         return renderer
 
     def _renderer(self, size: tuple[int, int]) -> mujoco.Renderer:
+        """The renderer for images of a height and a width [px], made when first needed."""
         height, width = size
         if max(size) > MAX_RENDER_PX:
             raise ValueError(
@@ -157,12 +174,12 @@ def _close(renderers: dict[tuple[int, int], mujoco.Renderer]) -> None:
 
 
 def _set_camera(scene: mujoco.MjvScene, camera: Camera, model: mujoco.MjModel) -> None:
-    """Give the scene exactly our camera: any pose, focal length and principal point."""
+    """Give the scene our camera with its pose, focal length and principal point."""
     world_to_cam = np.asarray(camera.world_to_cam, np.float64)
     rotation = world_to_cam[:3, :3]
     eye = -rotation.T @ world_to_cam[:3, 3]
     focal, (cx, cy) = float(camera.focal), np.asarray(camera.principal_point, np.float64)
-    # MuJoCo turns its depth buffer into meters with these planes, so they are not ours to choose.
+    # MuJoCo turns its depth buffer into meters with these planes, so they must stay as they are.
     near = model.vis.map.znear * model.stat.extent
     far = model.vis.map.zfar * model.stat.extent
     for view in scene.camera:

@@ -33,6 +33,7 @@ def composite(
     Returns:
         rgb (H, W, 3) over black, and alpha (H, W).
     """
+    # Optical depth of each splat at each pixel, from near to far.
     order = jnp.argsort(depth)
     y, x = (jnp.arange(n, dtype=pixel.dtype) + 0.5 for n in size)
 
@@ -43,6 +44,7 @@ def composite(
         return density * jnp.exp(-0.5 * squared)
 
     depths = jax.vmap(optical_depth)(pixel[order], covariance[order], density[order])
+    # Each splat adds its color times its alpha times the light that passes all nearer splats.
     alpha = -jnp.expm1(-depths)
     passed = jnp.cumprod(1.0 - alpha, axis=0)
     arriving = jnp.concatenate([jnp.ones_like(passed[:1]), passed[:-1]])
@@ -52,7 +54,9 @@ def composite(
 def render_reference(
     model: SplatModel, poses: jax.Array, camera: Camera
 ) -> tuple[jax.Array, jax.Array]:
-    """Like :func:`vrrt_jax.splat.raster.render`, but with true occlusion, and slow.
+    """Render a posed robot with true occlusion, and slowly.
+
+    The images differ from those of :func:`vrrt_jax.splat.raster.render` only in occlusion.
 
     Args:
         model: splats bound to links.
@@ -62,12 +66,14 @@ def render_reference(
     Returns:
         rgb (H, W, 3), the robot over black, and alpha (H, W).
     """
+    # A small isotropic splat has a round footprint.
     rotation, translation = poses[model.link, :3, :3], poses[model.link, :3, 3]
     mean = jnp.einsum("gij,gj->gi", rotation, model.mean) + translation
     pixel, depth = project(camera, mean)
     visible = depth > NEAR
     radius = camera.focal * model.radius / jnp.where(visible, depth, 1.0)
     covariance = (radius**2 + PIXEL_BLUR**2)[:, None, None] * jnp.eye(2)
+    # Colors toward the camera.
     eye = -camera.world_to_cam[:3, :3].T @ camera.world_to_cam[:3, 3]
     to_eye = eye - mean
     to_eye = to_eye * jax.lax.rsqrt(jnp.sum(to_eye**2, axis=-1, keepdims=True) + 1e-12)

@@ -1,7 +1,7 @@
 """Cameras, splats and goal images.
 
-Letters: ``G`` splats, ``V`` views, ``H W`` image. Images are float32 in [0, 1]; the camera looks
-along its z axis, x to the right and y down.
+Letters: ``G`` splats, ``V`` views, ``H W`` image, ``L`` links. Images are float32 in [0, 1]. The
+camera looks along its z axis, with x to the right and y down.
 """
 
 import jax
@@ -27,13 +27,13 @@ class SplatModel:
 
     mean: jax.Array  # (G, 3) center in the link's frame [m]
     radius: jax.Array  # (G,) standard deviation [m]
-    density: jax.Array  # (G,) optical depth at the center; alpha = 1 - exp(-sum)
-    rgb: jax.Array  # (G, 3) color seen from nowhere in particular
-    view_color_gradient: (
-        jax.Array
-    )  # (G, 3) color factor = 1 + view_color_gradient . direction to the camera, in link frame
+    density: jax.Array  # (G,) optical depth at the center; alpha = 1 - exp(-sum of all splats)
+    rgb: jax.Array  # (G, 3) mean color over all directions
+    # (G, 3) in the link's frame: the color is rgb * (1 + view_color_gradient . d), where d is the
+    # direction from the splat to the camera.
+    view_color_gradient: jax.Array
     link: jax.Array  # (G,) i32
-    tau: jax.Array  # () softness of occlusion [m]
+    tau: jax.Array  # () softness of occlusion [m]: the depth over which a weight falls to 1 / e
     starts: tuple[int, ...] = static(default=(0,))  # first splat of each layer of whole links
 
     @property
@@ -43,12 +43,15 @@ class SplatModel:
 
 
 def layer_starts(link: np.ndarray) -> tuple[int, ...]:
-    """First splats of two layers, of the inner and the outer half of the links.
+    """First splats of two layers: the inner half of the links, and the outer half.
 
-    An arm before its own body needs them most.
+    Layers matter most where an arm is in front of its own body.
 
     Args:
-        link: (G,) of each splat, rising.
+        link: (G,) link of each splat, in rising order.
+
+    Returns:
+        (0, first splat of the outer half), or (0,) if one half has no splats.
     """
     outer = int(np.searchsorted(link, (link[-1] + 1) // 2))
     return (0, outer) if 0 < outer < len(link) else (0,)
@@ -56,8 +59,8 @@ def layer_starts(link: np.ndarray) -> tuple[int, ...]:
 
 @pytree
 class GoalImage:
-    """What the robot should look like, in V views of one size."""
+    """Images of the robot at the goal, in V views of one size."""
 
     rgb: jax.Array  # (V, H, W, 3) the robot over black
     alpha: jax.Array  # (V, H, W) share of the pixel that the robot covers
-    valid: jax.Array  # (V, H, W) weight of the pixel in the loss, 0 where unknown
+    valid: jax.Array  # (V, H, W) weight of the pixel in the loss, 0 where the image is unknown

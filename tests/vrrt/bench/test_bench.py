@@ -89,7 +89,7 @@ def test_twins_look_alike(near_task, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(pose_ambiguity, "ROBOTS", ("ur5e",))
     monkeypatch.setattr(pose_ambiguity, "LEVELS", (2.5,))
-    monkeypatch.setattr(pose_ambiguity, "LOOKED_AT", 1)
+    monkeypatch.setattr(pose_ambiguity, "NUM_COMPARED", 1)
     figure = tmp_path / "twins.png"
     assert main(["bench", "twins", "--tasks-per-level", "9", "--figure", str(figure)]) == 0
     (level,) = json.loads(capsys.readouterr().out)["ur5e"]

@@ -117,6 +117,16 @@ def chain_positions(robot, q):
     return np.asarray(poses)[:, 1:, :3, 3]
 
 
+@pytest.fixture(scope="module")
+def arm_path(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("robots"), ARM)
+
+
+@pytest.fixture(scope="module")
+def arm(arm_path):
+    return load_robot(arm_path)
+
+
 def random_q(robot, num, seed=0):
     rng = np.random.default_rng(seed)
     return rng.uniform(robot.lower, robot.upper, (num, robot.num_joints))
@@ -252,9 +262,8 @@ def test_pairs_are_those_of_c_mujoco(panda):
     assert colliding > 20
 
 
-def test_every_kind_of_geom_and_joint(tmp_path):
-    path = write(tmp_path, ARM)
-    robot = load_robot(path)
+def test_every_kind_of_geom_and_joint(arm, arm_path):
+    robot, path = arm, arm_path
     assert robot.joint_names == ("turn", "bend", "roll", "reach")
     assert robot.is_continuous.tolist() == [False, True, False, False]
     np.testing.assert_allclose(robot.lower, [np.radians(-100), -np.pi, np.radians(-90), 0])
@@ -308,9 +317,8 @@ def test_written_model_loads_as_the_same_robot(tmp_path):
     assert again.ignored_pairs == robot.ignored_pairs
 
 
-def test_bodies_with_several_joints_belong_to_the_last(tmp_path):
-    robot = load_robot(write(tmp_path, ARM))
-    spec = mesh_sources.mesh_spec(robot)
+def test_bodies_with_several_joints_belong_to_the_last(arm):
+    spec = mesh_sources.mesh_spec(arm)
     assert spec is not None
     model = spec.compile()
     link = dict(
