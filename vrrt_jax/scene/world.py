@@ -18,13 +18,19 @@ from vrrt_jax.core.types import PytreeSubclasses, TraceIgnoredNames, pytree, sta
 from vrrt_jax.robots.kinematics import Chain
 from vrrt_jax.scene.obstacles import Obstacle, Obstacles, floats, from_slots, to_slots
 
+_NO_ENGINE = (
+    "World is an interface without an engine: subclass the world of an engine, such as "
+    "vrrt_jax.scene.closed_form.ClosedFormWorld"
+)
+
 
 @pytree
 class World(PytreeSubclasses, StraightLineEdges):
     """All that planners ask about robot and obstacles.
 
-    Subclass an engine's world to add a constraint of your own: planners ask :meth:`is_free` only.
-    Subclasses are pytree dataclasses by themselves, so that new fields may be arrays.
+    To add a constraint of your own, subclass the world of an engine and override :meth:`is_free`:
+    planners ask nothing else. Subclasses are pytree dataclasses by themselves, so that new fields
+    may be arrays. ``KeepOut(**vars(world), center=...)`` makes one of a world that was built.
 
     Letters: ``D`` joints, ``K`` obstacle slots.
     """
@@ -43,11 +49,11 @@ class World(PytreeSubclasses, StraightLineEdges):
 
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`is_free`; for engines to answer."""
-        raise NotImplementedError
+        raise NotImplementedError(_NO_ENGINE)
 
     def obstacle_clearance(self, q: jax.Array) -> jax.Array:
         """See :func:`obstacle_clearance`; for engines to answer."""
-        raise NotImplementedError
+        raise NotImplementedError(_NO_ENGINE)
 
     def with_margin(self, margin: float) -> Self:
         """See :func:`with_margin`."""

@@ -221,7 +221,7 @@ def test_gripper_is_mounted_rigidly_where_its_joints_rest():
 
 
 def test_collision_model_checks_what_it_should(panda):
-    """Cover against obstacles, thin against thin, nothing else, in C MuJoCo by itself."""
+    """Collision spheres against obstacles, self-collision spheres against each other, no more."""
     spec = mujoco.MjSpec.from_string(panda.xml)
     spec.worldbody.add_geom(
         name="obstacle", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.6] * 3, contype=1, conaffinity=0

@@ -246,5 +246,5 @@ def test_the_decorator_is_optional_for_subclasses(wall_world):
 def test_an_engine_must_answer(wall_world):
     names = [field.name for field in dataclasses.fields(World)]
     world = World(**{name: getattr(wall_world, name) for name in names})
-    with pytest.raises(NotImplementedError):
+    with pytest.raises(NotImplementedError, match="subclass the world of an engine"):
         vrrt_jax.is_free(world, jnp.zeros(7))
