@@ -69,7 +69,7 @@ def run(
     Args:
         robot: the robot.
         homes: from :func:`unseen_homes`.
-        method: one of :data:`nrp_jax.planner.METHODS`.
+        method: one of :data:`nrp_jax.planner.PLANNERS`.
         sampler: for the methods that need one.
         max_expansions: of a plan.
         lanes: expansions at a time.

@@ -121,7 +121,7 @@ def rrt_is(world: GridWorld, q_start: jax.Array, q_goal: jax.Array, key: jax.Arr
     """Whether RRT-IS reaches the goal (D,) from the start (D,) within 300 expansions, () bool.
 
     One extension after the other, as the paper counts expansions. The planner's RRT-IS
-    (:class:`nrp_jax.planners.nrp.RRT`) extends many nodes at a time and would measure another
+    (:class:`vrrt_jax.core.planners.rrt.RRT`) extends many nodes at a time and would measure another
     difficulty; homes of data sets depend on this one.
     """
     nodes = jnp.zeros((_CAPACITY, q_start.shape[0])).at[0].set(q_start)

@@ -69,7 +69,7 @@ class CarWorld(GridWorld):
     def truncate(self, edge: CarEdge, fraction: jax.Array) -> CarEdge:
         """See :class:`vrrt_jax.core.edges.Space`."""
         return CarEdge(
-            curve=reeds_shepp.cut(edge.curve, fraction, self.radius),
+            curve=reeds_shepp.truncate(edge.curve, fraction, self.radius),
             arm=edge.arm * fraction[..., None],
             target=edge.target,
             done=edge.done * fraction,

@@ -80,7 +80,7 @@ def _extents(curve: Curve, radius: jax.Array | float) -> list[jax.Array]:
     ]
 
 
-def cut(curve: Curve, fraction: jax.Array, radius: jax.Array | float) -> Curve:
+def truncate(curve: Curve, fraction: jax.Array, radius: jax.Array | float) -> Curve:
     """The first fraction (...) of curves, measured by their :func:`extent`."""
     # Piece by piece: drive it as far as what is left of the extent allows.
     left, drives = fraction * extent(curve, radius), []

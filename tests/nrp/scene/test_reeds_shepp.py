@@ -17,7 +17,7 @@ length = jax.jit(lambda a, b: reeds_shepp.length(a, b, RADIUS))
 def interpolate(a, b, fraction):
     """Poses (..., 3) at a fraction (...) of the shortest curves."""
     curve = reeds_shepp.shortest(a, b, RADIUS)
-    return reeds_shepp.follow(a, reeds_shepp.cut(curve, fraction, RADIUS), RADIUS)
+    return reeds_shepp.follow(a, reeds_shepp.truncate(curve, fraction, RADIUS), RADIUS)
 
 
 def poses(rng, n, reach=0.6):
