@@ -1,17 +1,23 @@
 """Neural randomized planning in JAX: learned samplers for long-horizon motion in homes."""
 
+from nrp_jax.config import PlannerConfig
 from nrp_jax.homes.grid import Grid, load_map
-from nrp_jax.planner import PlanResult, Status, plan
+from nrp_jax.planner import plan
 from nrp_jax.samplers import load_sampler
 from nrp_jax.scene.robots import MobileRobot, link_features, load_robot
 from nrp_jax.scene.world import GridWorld, batch_is_free, build_world, is_free, with_grid
+from vrrt_jax.core.goal import ConfigurationGoal
+from vrrt_jax.core.result import PlanResult, Status, Verification
 
 __all__ = [
+    "ConfigurationGoal",
     "Grid",
     "GridWorld",
     "MobileRobot",
     "PlanResult",
+    "PlannerConfig",
     "Status",
+    "Verification",
     "batch_is_free",
     "build_world",
     "is_free",

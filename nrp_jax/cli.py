@@ -84,7 +84,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         arguments.start,
         arguments.goal,
         key=jax.random.key(arguments.seed),
-        method=arguments.method,
+        planner=arguments.method,
         sampler=sampler,
         world=world,
         max_expansions=arguments.max_expansions,
@@ -104,7 +104,10 @@ def _plan(arguments: argparse.Namespace) -> int:
             print("no figure: matplotlib is missing; pip install 'vrrt-jax[plot]'", file=sys.stderr)
     if not result.ok:
         problem = result.verification.contact if result.verification else None
-        print(f"{result.status.value}{f' ({problem})' if problem else ''}", file=sys.stderr)
+        print(
+            f"{result.status.value}; {result.advice}{f' ({problem})' if problem else ''}",
+            file=sys.stderr,
+        )
     return EXIT_SOLVED if result.ok else EXIT_UNSOLVED
 
 

@@ -6,15 +6,35 @@ from vrrt_jax.gl import choose_backend as _choose_backend
 
 _choose_backend()  # before anything imports MuJoCo
 
-from vrrt_jax.config import PlannerConfig, PlanResult  # noqa: E402
-from vrrt_jax.core.edges import difference, distance  # noqa: E402
-from vrrt_jax.core.types import Status  # noqa: E402
+from vrrt_jax.config import (  # noqa: E402
+    Budget,
+    ExpandConfig,
+    MatchConfig,
+    PlannerConfig,
+    PolishConfig,
+    SeedConfig,
+    TreeConfig,
+)
+from vrrt_jax.core.edges import Space, difference, distance  # noqa: E402
+from vrrt_jax.core.goal import ConfigurationGoal, LeastSquaresGoal  # noqa: E402
+from vrrt_jax.core.planners import PLANNERS, RRT, RRTConnect, RRTStar  # noqa: E402
+from vrrt_jax.core.result import PlanResult, Status, Verification  # noqa: E402
+from vrrt_jax.core.search import make_termination, search  # noqa: E402
+from vrrt_jax.core.types import (  # noqa: E402
+    Expansion,
+    ExpansionPolicy,
+    Goal,
+    Proposals,
+    Tree,
+    pytree,
+    static,
+)
 from vrrt_jax.planner import plan, plan_batch, plan_to_configuration  # noqa: E402
 from vrrt_jax.problems import Problem, load_problem, load_world, problem_names  # noqa: E402
 from vrrt_jax.robots import Robot, load_robot, robot_names  # noqa: E402
 from vrrt_jax.robots.kinematics import link_poses  # noqa: E402
 from vrrt_jax.scene.obstacles import Obstacle  # noqa: E402
-from vrrt_jax.scene.verify import Verification, verify_path  # noqa: E402
+from vrrt_jax.scene.verify import verify_path  # noqa: E402
 from vrrt_jax.scene.world import (  # noqa: E402
     World,
     build_world,
@@ -29,19 +49,42 @@ from vrrt_jax.splat.images import read_image, write_image  # noqa: E402
 from vrrt_jax.splat.model import SelfModel, load_self_model, save_self_model  # noqa: E402
 from vrrt_jax.splat.raster import render  # noqa: E402
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel  # noqa: E402
+from vrrt_jax.visual.goal import ImageGoal, ImageObjective  # noqa: E402
+from vrrt_jax.visual.policy import VisualRRT  # noqa: E402
 
 __all__ = [
+    "Budget",
     "Camera",
+    "ConfigurationGoal",
+    "ExpandConfig",
+    "Expansion",
+    "ExpansionPolicy",
+    "Goal",
     "GoalImage",
+    "ImageGoal",
+    "ImageObjective",
+    "LeastSquaresGoal",
+    "MatchConfig",
     "Obstacle",
+    "PLANNERS",
     "PlanResult",
     "PlannerConfig",
+    "PolishConfig",
     "Problem",
+    "Proposals",
+    "RRT",
+    "RRTConnect",
+    "RRTStar",
     "Robot",
+    "SeedConfig",
     "SelfModel",
+    "Space",
     "SplatModel",
     "Status",
+    "Tree",
+    "TreeConfig",
     "Verification",
+    "VisualRRT",
     "World",
     "build_world",
     "camera_from_matrix",
@@ -54,6 +97,7 @@ __all__ = [
     "load_self_model",
     "load_world",
     "look_at",
+    "make_termination",
     "move_obstacle",
     "obstacle_clearance",
     "obstacle_list",
@@ -62,10 +106,13 @@ __all__ = [
     "plan_batch",
     "plan_to_configuration",
     "problem_names",
+    "pytree",
     "read_image",
     "render",
     "robot_names",
     "save_self_model",
+    "search",
+    "static",
     "verify_path",
     "with_obstacles",
     "write_image",

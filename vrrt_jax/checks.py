@@ -9,72 +9,10 @@ import numpy as np
 from vrrt_jax.robots.kinematics import Chain, link_poses
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.verify import contacts
-from vrrt_jax.scene.world import World, is_free, obstacle_list
+from vrrt_jax.scene.world import World, batch_is_free, obstacle_list
 from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera, SplatModel
-
-_is_free = jax.jit(is_free)
-
-# name: (lowest, highest)
-RANGES = {
-    "alpha": (0.0, 1.0),
-    "epsilon": (0.0, 1.0),
-    "eta": (0.0, 1.0),
-    "exploration": (0.0, 1.0),
-    "anneal": (0.0, np.inf),
-    "match_scale": (1e-9, np.inf),
-    "rewire_radius": (0.0, np.inf),
-    "min_improvement": (0.0, np.inf),
-    "verify_step": (1e-4, 1.0),
-    "time_limit_s": (0.0, np.inf),
-    "max_iterations": (1, np.inf),
-    "patience": (1, np.inf),
-    "settle": (0, np.inf),
-    "min_ratio": (0.0, 1.0),
-    "shortcut_rounds": (0, np.inf),
-    "connect_iterations": (1, np.inf),
-    "probes": (0, 1 << 20),
-    "probes_kept": (1, np.inf),
-    "probe_radius": (0.0, np.inf),
-    "probe_px": (8, 4096),
-    "hypotheses": (0, 1024),
-    "attempts": (1, 1024),
-    "probe_rounds": (0, 1024),
-    "polish_samples": (1, 65536),
-    "polish_lanes": (1, 1024),
-    "polish_kept": (1, 1024),
-    "polish_px": (8, 4096),
-    "close_px": (0, 4096),
-    "polish_rounds": (1, 1024),
-    "polish_steps": (0, 1024),
-    "polish_spread": (0.0, np.inf),
-    "start_prior": (0.0, np.inf),
-    "start_preference": (0.0, np.inf),
-    "probe_alpha": (0.0, 1.0),
-    "probe_steps": (0, 100_000),
-    "lanes": (2, 4096),
-    "image_px": (8, 4096),
-}
-
-
-def check_config(config: Any) -> None:
-    """Raise a ValueError that names the setting out of range."""
-    for name, (low, high) in RANGES.items():
-        value = getattr(config, name)
-        if value is None and name == "patience":
-            continue
-        if value is None or not low <= value <= high:
-            raise ValueError(f"{name}={value} is out of range; expected {low} to {high}")
-    for name in ("kappa", "beta1", "beta2"):
-        if not 0.0 <= getattr(config, name) < 1.0:
-            raise ValueError(f"{name}={getattr(config, name)} is out of range; expected [0, 1)")
-    roots = 2 + min(config.probes, config.probes_kept)
-    if config.capacity < config.lanes + roots:
-        raise ValueError(
-            f"capacity={config.capacity} leaves no room for {roots - 1} roots and one iteration of "
-            f"{config.lanes} lanes; expected at least {config.lanes + roots}, for example 8192"
-        )
 
 
 def check_limits(robot: Robot, q: Any, what: str) -> np.ndarray:
@@ -119,7 +57,7 @@ def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.n
             f"'{robot.name}', has {', '.join(robot.joint_names)}: build the world for it"
         )
     q = check_limits(robot, q, what)
-    if not bool(_is_free(world, jnp.asarray(q))):
+    if not bool(batch_is_free(world, jnp.asarray(q)[None])[0]):
         obstacles = obstacle_list(world)
         touching = contacts(robot, obstacles, q) or contacts(
             robot, obstacles, q, geometry="spheres"

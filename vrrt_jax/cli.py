@@ -136,13 +136,13 @@ def _plan(arguments: argparse.Namespace) -> int:
 
     out = _writable(arguments.out)
     problem = _problem(arguments)
-    changes: dict[str, Any] = {"time_limit_s": arguments.time_limit}
+    changes: dict[str, Any] = {"budget.time_limit_s": arguments.time_limit}
     if arguments.capacity is not None:
-        changes["capacity"] = arguments.capacity
+        changes["tree.capacity"] = arguments.capacity
     make = vrrt_jax.PlannerConfig.paper if arguments.paper else vrrt_jax.PlannerConfig
-    config = make(**changes)
+    config = make().changed(changes)
     print(f"{problem.name}: {problem.robot.name}, seed {arguments.seed}; compiling ...", flush=True)
-    with tqdm(total=config.max_iterations, unit="it", disable=None, leave=False) as bar:
+    with tqdm(total=config.budget.max_iterations, unit="it", disable=None, leave=False) as bar:
 
         def on_progress(state, seconds):
             bar.n = int(state.tree.iteration)
@@ -152,9 +152,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         result = vrrt_jax.plan(
             problem.robot,
             problem.world,
-            problem.self_model,
-            problem.cameras,
-            problem.goal_images,
+            problem.goal,
             problem.q_start,
             key=jax.random.key(arguments.seed),
             config=config,
@@ -165,7 +163,7 @@ def _plan(arguments: argparse.Namespace) -> int:
     if not arguments.no_pictures:
         _pictures(problem, result, out)
     if not result.ok:
-        print(f"{result.status.name}: {result.status.value}", file=sys.stderr)
+        print(f"{result.status.name}: {result.status.value}; {result.advice}", file=sys.stderr)
     return EXIT_SOLVED if result.ok else EXIT_UNSOLVED
 
 
@@ -236,9 +234,9 @@ def _render(arguments: argparse.Namespace) -> int:
     camera = problems.camera_from_dict(problems.read_json(arguments.camera), (height, width))
     q = checks.check_limits(robot, np.array(arguments.q), "configuration")
     picture = MeshRenderer(_meshes(robot)).picture(q, camera)
-    if not picture.coverage.any():
+    if not picture.alpha.any():
         raise ValueError("the camera does not see the robot at this configuration; nothing written")
-    write_image(arguments.out, picture.rgb, picture.coverage)
+    write_image(arguments.out, picture.rgb, picture.alpha)
     print(f"wrote {arguments.out}")
     return EXIT_SOLVED
 
@@ -310,11 +308,11 @@ def _speed(arguments: argparse.Namespace) -> int:
 
 
 def _twins(arguments: argparse.Namespace) -> int:
-    from vrrt_jax.bench import twins
+    from vrrt_jax.bench import pose_ambiguity
 
     if arguments.figure:
-        twins.draw(arguments.figure)
-    return _figures(twins.run(arguments.tasks_per_level), arguments)
+        pose_ambiguity.draw(arguments.figure)
+    return _figures(pose_ambiguity.run(arguments.tasks_per_level), arguments)
 
 
 def _figures(figures: dict[str, Any], arguments: argparse.Namespace) -> int:

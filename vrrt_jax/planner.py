@@ -2,213 +2,131 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax import checks
-from vrrt_jax.config import PlannerConfig, PlanResult
-from vrrt_jax.core import tree as trees
-from vrrt_jax.core.planners.rrt import RRT, tree_path
-from vrrt_jax.core.planners.rrt_connect import RRTConnect, connection_path
-from vrrt_jax.core.search import interruptible, make_termination, search
-from vrrt_jax.core.types import Status, Tree
+from vrrt_jax.config import PlannerConfig, check_config
+from vrrt_jax.core.check_protocols import check_goal, check_policy
+from vrrt_jax.core.goal import ConfigurationGoal
+from vrrt_jax.core.interrupt import interruptible
+from vrrt_jax.core.planners import PLANNERS, RRT, RRTStar
+from vrrt_jax.core.result import ABORTED, STATUS_OF, PlanResult, Status, with_time_of
+from vrrt_jax.core.search import make_termination, search
+from vrrt_jax.core.timing import timed
+from vrrt_jax.core.types import ExpansionPolicy, Goal, Tree
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.world import World
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera
-from vrrt_jax.visual.finish import (
-    HURRIED,
-    STATUS_OF,
-    finish,
-    finish_visual,
-    time_left,
-    timed,
-    with_time_of,
-)
-from vrrt_jax.visual.goal import Setup, Sight, visual_setup, visual_termination
-from vrrt_jax.visual.policy import best_probes, forest, plant
+from vrrt_jax.visual.finish import ADVICE, Chosen, finish, finish_visual, time_left
+from vrrt_jax.visual.goal import ImageGoal
+from vrrt_jax.visual.policy import VisualRRT, init_forest
+from vrrt_jax.visual.problem import VisualProblem, make_problem
+from vrrt_jax.visual.seeds import sample_seeds, seeded_roots
 
-PLANTING = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
-ENDED = tuple(STATUS_OF[stopped] for stopped in HURRIED)  # before losses compare with others'
-AGAIN = (Status.NO_MATCH, Status.NO_PATH, Status.NOT_VERIFIED)  # worth another attempt
-RRT_STAR_RADIUS = 1.9  # [rad] nodes of a sparse tree in seven dimensions lie that far apart
+SEED_KEY = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
+RETRYABLE = (Status.NO_MATCH, Status.NO_PATH, Status.NOT_VERIFIED)  # worth another attempt
+VISUAL = "visual-rrt"
+
+Image = np.ndarray | Sequence[np.ndarray]
+AnyGoal = ImageGoal | ConfigurationGoal | Goal
+Progress = Callable[..., Any] | None
 
 
+@overload
+def plan(
+    robot: Robot,
+    world: World,
+    goal: AnyGoal,
+    q_start: np.ndarray,
+    *,
+    key: jax.Array,
+    planner: str | ExpansionPolicy | None = None,
+    config: PlannerConfig | None = None,
+    q_guess: np.ndarray | None = None,
+    on_progress: Progress = None,
+) -> PlanResult: ...
+@overload
 def plan(
     robot: Robot,
     world: World,
     self_model: SelfModel,
     camera: Camera | Sequence[Camera],
-    goal_image: np.ndarray | Sequence[np.ndarray],
+    goal_image: Image,
     q_start: np.ndarray,
+    /,
     *,
     key: jax.Array,
+    planner: str | ExpansionPolicy | None = None,
     config: PlannerConfig | None = None,
-    mask: np.ndarray | Sequence[np.ndarray] | None = None,
+    mask: Image | None = None,
     q_guess: np.ndarray | None = None,
-    on_progress: Callable[..., Any] | None = None,
+    on_progress: Progress = None,
+) -> PlanResult: ...
+def plan(
+    robot: Robot,
+    world: World,
+    goal: Any,
+    *inputs: Any,
+    q_start: np.ndarray | None = None,
+    key: jax.Array,
+    planner: str | ExpansionPolicy | None = None,
+    config: PlannerConfig | None = None,
+    mask: Image | None = None,
+    q_guess: np.ndarray | None = None,
+    on_progress: Progress = None,
 ) -> PlanResult:
-    """Find a collision-free path whose end looks like the goal image.
+    """Find a collision-free path to a goal: ``plan(robot, world, goal, q_start, key=key)``.
+
+    ``plan(robot, world, self_model, camera, goal_image, q_start, key=key)`` is short for the goal
+    ``ImageGoal(self_model, camera, goal_image, mask)``.
 
     Args:
         robot: from :func:`load_robot`.
         world: from :func:`load_world` or :func:`build_world`, for this robot.
-        self_model: from :func:`load_self_model`, for this robot.
-        camera: the view of the goal image; or V of them.
-        goal_image: (H, W, 4) RGB and mask, or (H, W, 3) on a plain background; uint8, or float in
-            [0, 1]; or V of them.
+        goal: an :class:`ImageGoal`, a :class:`ConfigurationGoal`, or any pytree with a
+            differentiable ``loss(world, q)`` and a ``threshold``.
+        inputs: ``q_start``, unless it is given by name.
         q_start: (D,) start configuration [rad] or [m].
         key: random key; the same key gives the same plan on the same machine, unless time ends it.
-        config: settings, the default ones if None.
+        planner: "visual-rrt", or to a joint goal "rrt-connect" (the default there), "rrt" or
+            "rrt-star" (goes on to improve until its iterations are used up); or a policy of the
+            kernel, see :class:`~vrrt_jax.core.types.ExpansionPolicy`.
+        config: settings, the default ones if None. To a joint goal, the budget and the size of the
+            tree are used.
         mask: (H, W) bool, True for the pixels of the goal image that are compared, where not all
-            are: something may hide the robot; or V of them.
+            are; or V of them. For the second form.
         q_guess: (D,) where the goal roughly is, if that is known: searched from too.
         on_progress: called with the search state and the seconds so far.
 
     Raises:
         ValueError: an input makes no sense; the message says what to do.
     """
-    config = config or PlannerConfig()
-    checks.check_config(config)
-    q_start = checks.check_start(robot, world, q_start)
-    sight = Sight(robot, self_model, camera, goal_image, mask)
-    setup = visual_setup(sight, q_start, config)
-    roots = q_start[None]
+    inputs = inputs if q_start is None else (*inputs, q_start)
+    if isinstance(goal, SelfModel):
+        goal, inputs = _image_goal(goal, inputs, mask)
+    elif mask is not None:
+        raise ValueError("mask is given beside a goal; expected ImageGoal(..., mask=mask)")
+    (start,) = _counted(inputs, "q_start")
+    config = PlannerConfig() if config is None else config
+    check_config(config)
+    if not isinstance(goal, ImageGoal):
+        check_goal(goal)
+    start = checks.check_start(robot, world, start)
+    policy = _policy(planner, goal, config)
+    roots = start[None]
     if q_guess is not None:
-        roots = np.stack([q_start, checks.check_limits(robot, q_guess, "guess")])
-    with interruptible():
-        result = _attempt(robot, world, setup, roots, key, config, on_progress)
-        for again in range(1, config.attempts):
-            rest = time_left(config, result.timing["search_s"])
-            if result.status not in AGAIN or rest.time_limit_s == 0:
-                break
-            key = jax.random.fold_in(key, PLANTING - again)
-            other = _attempt(robot, world, setup, roots, key, rest, on_progress)
-            if other.status in ENDED and not other.ok:
-                best = dataclasses.replace(result, status=other.status)
-            else:
-                best = min(result, other, key=lambda r: (not r.ok, r.loss))
-            result = with_time_of(best, result, other)
-    return result
-
-
-def _attempt(
-    robot: Robot,
-    world: World,
-    setup: Setup,
-    roots: np.ndarray,
-    key: jax.Array,
-    config: PlannerConfig,
-    on_progress: Callable[..., Any] | None,
-) -> PlanResult:
-    """Probe around the start (the first of the roots), search and finish, once."""
-    tree, compile_s, plant_s = _planted(world, setup, roots, key, config)
-    found = search(
-        world,
-        setup.policy,
-        tree,
-        key=key,
-        stop=visual_termination(config, setup.goal_loss),
-        time_limit_s=time_left(config, plant_s).time_limit_s,
-        on_progress=on_progress,
-    )
-    found = dataclasses.replace(
-        found, compile_s=found.compile_s + compile_s, search_s=found.search_s + plant_s
-    )
-    ends = (setup.goal_loss, setup.polishing, roots[0])
-    return finish_visual(robot, world, found, *ends, key, config)
-
-
-def _planted(
-    world: World, setup: Setup, roots: np.ndarray, key: jax.Array, config: PlannerConfig
-) -> tuple[Tree, float, float]:
-    """The forest before the search, and the seconds for its compilation and for itself."""
-    key = jax.random.fold_in(key, PLANTING)
-    seeds = (setup.policy, setup.probing, roots, key, config.capacity)
-    return timed(lambda: plant(world, *seeds), best_probes, forest)
-
-
-def plan_batch(
-    robot: Robot,
-    world: World,
-    self_model: SelfModel,
-    camera: Camera | Sequence[Camera],
-    goal_images: Sequence[np.ndarray | Sequence[np.ndarray]],
-    q_starts: np.ndarray,
-    *,
-    key: jax.Array,
-    config: PlannerConfig | None = None,
-    on_progress: Callable[..., Any] | None = None,
-) -> list[PlanResult]:
-    """Solve Q problems of one robot, world and camera at once, by an outer ``vmap``.
-
-    Problem ``i`` uses the key ``fold_in(key, i)``; each has one attempt. The search times reported
-    hold the search of the whole batch. On a CPU a loop over :func:`plan` is as fast; on other
-    devices the batch pays.
-
-    Args:
-        robot: from :func:`load_robot`.
-        world: for this robot.
-        self_model: for this robot.
-        camera: the view of all goal images; or V of them.
-        goal_images: Q goal images, or Q lists of V; see :func:`plan`.
-        q_starts: (Q, D) start configurations.
-        key: random key.
-        config: settings, the default ones if None.
-        on_progress: called with the batched search state and the seconds so far.
-
-    Raises:
-        ValueError: an input makes no sense; the message names the problem.
-    """
-    config = config or PlannerConfig()
-    checks.check_config(config)
-    if len(goal_images) != len(q_starts) or len(goal_images) == 0:
-        raise ValueError(
-            f"got {len(goal_images)} goal images and {len(q_starts)} starts; expected as many, "
-            "and at least one"
-        )
-    starts, setups = [], []
-    for i, (image, q_start) in enumerate(zip(goal_images, q_starts, strict=True)):
-        try:
-            starts.append(checks.check_start(robot, world, q_start))
-            sight = Sight(robot, self_model, camera, image)
-            setups.append(visual_setup(sight, starts[-1], config))
-        except ValueError as error:
-            raise ValueError(f"problem {i}: {error}") from None
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(starts)))
-    with interruptible():
-        forests, compile_s, plant_s = zip(
-            *(
-                _planted(world, setup, q_start[None], own_key, config)
-                for setup, q_start, own_key in zip(setups, starts, keys, strict=True)
-            ),
-            strict=True,
-        )
-        found = search(
-            world,
-            _stack([setup.policy for setup in setups]),
-            _stack(forests),
-            key=keys,
-            stop=_stack([visual_termination(config, setup.goal_loss) for setup in setups]),
-            time_limit_s=time_left(config, sum(plant_s)).time_limit_s,
-            batched=True,
-            on_progress=on_progress,
-        )
-        results = []
-        for i, (q_start, setup) in enumerate(zip(starts, setups, strict=True)):
-            own = dataclasses.replace(
-                found,
-                tree=jax.tree.map(lambda leaf: leaf[i], found.tree),  # noqa: B023 - used at once
-                stopped=found.stopped_each[i],
-                compile_s=found.compile_s + sum(compile_s),
-                search_s=found.search_s + plant_s[i],
-            )
-            ends = (setup.goal_loss, setup.polishing, q_start)
-            results.append(finish_visual(robot, world, own, *ends, keys[i], config))
-    return results
+        roots = np.stack([start, checks.check_limits(robot, q_guess, "guess")])
+    if isinstance(goal, ConfigurationGoal):
+        q_goal = checks.check_start(robot, world, goal.q, what="goal")
+        goal = dataclasses.replace(goal, q=jnp.asarray(q_goal))
+        return _plan_to_configuration(robot, world, goal, policy, roots, key, config, on_progress)
+    problem = make_problem(robot, goal, start, config)
+    return _plan_by_loss(robot, world, problem, policy, roots, key, config, on_progress)
 
 
 def plan_to_configuration(
@@ -218,12 +136,12 @@ def plan_to_configuration(
     q_goal: np.ndarray,
     *,
     key: jax.Array,
-    planner: str = "rrt-connect",
+    planner: str | ExpansionPolicy = "rrt-connect",
     config: PlannerConfig | None = None,
     goal_bias: float = 0.1,
-    on_progress: Callable[..., Any] | None = None,
+    on_progress: Progress = None,
 ) -> PlanResult:
-    """Find a collision-free path to a joint goal, on the kernel that Visual-RRT runs on.
+    """Short for :func:`plan` with a :class:`ConfigurationGoal`.
 
     Args:
         robot: from :func:`load_robot`.
@@ -231,8 +149,7 @@ def plan_to_configuration(
         q_start: (D,) [rad] or [m].
         q_goal: (D,) [rad] or [m].
         key: random key.
-        planner: "rrt", "rrt-star" (goes on to improve until its iterations are used up) or
-            "rrt-connect".
+        planner: see :func:`plan`.
         config: budget, capacity and lanes are used.
         goal_bias: share of lanes that aim at the goal, for "rrt" and "rrt-star".
         on_progress: called with the search state and the seconds so far.
@@ -240,45 +157,296 @@ def plan_to_configuration(
     Raises:
         ValueError: an input makes no sense; the message says what to do.
     """
-    config = config or PlannerConfig()
-    checks.check_config(config)
-    q_start = checks.check_start(robot, world, q_start)
-    q_goal = checks.check_start(robot, world, q_goal, what="goal")
-    start, goal = jnp.asarray(q_start), jnp.asarray(q_goal)
-    if planner == "rrt-connect":
-        policy: Any = RRTConnect(lanes=config.lanes)
-        tree, stop_score = policy.forest(start, goal, config.capacity), 0.0
-    elif planner in ("rrt", "rrt-star"):
-        policy = RRT(
-            goal=goal,
-            goal_bias=jnp.float32(goal_bias),
-            rewire_radius=jnp.float32(RRT_STAR_RADIUS),
-            star=planner == "rrt-star",
-            lanes=config.lanes,
+    config = PlannerConfig() if config is None else config
+    if planner in ("rrt", "rrt-star"):
+        make = RRT if planner == "rrt" else RRTStar
+        planner = make(goal_bias=goal_bias, lanes=config.tree.lanes)
+    goal = ConfigurationGoal(q=np.asarray(q_goal))
+    run = {"key": key, "planner": planner, "config": config, "on_progress": on_progress}
+    return plan(robot, world, goal, q_start, **run)
+
+
+@overload
+def plan_batch(
+    robot: Robot,
+    world: World,
+    goals: Sequence[ImageGoal | Goal],
+    q_starts: np.ndarray,
+    *,
+    key: jax.Array,
+    planner: str | ExpansionPolicy | None = None,
+    config: PlannerConfig | None = None,
+    on_progress: Progress = None,
+) -> list[PlanResult]: ...
+@overload
+def plan_batch(
+    robot: Robot,
+    world: World,
+    self_model: SelfModel,
+    camera: Camera | Sequence[Camera],
+    goal_images: Sequence[Image],
+    q_starts: np.ndarray,
+    /,
+    *,
+    key: jax.Array,
+    planner: str | ExpansionPolicy | None = None,
+    config: PlannerConfig | None = None,
+    on_progress: Progress = None,
+) -> list[PlanResult]: ...
+def plan_batch(
+    robot: Robot,
+    world: World,
+    goals: Any,
+    *inputs: Any,
+    q_starts: np.ndarray | None = None,
+    key: jax.Array,
+    planner: str | ExpansionPolicy | None = None,
+    config: PlannerConfig | None = None,
+    on_progress: Progress = None,
+) -> list[PlanResult]:
+    """Solve Q problems of one robot and world at once, by an outer ``vmap``.
+
+    Call it as ``plan_batch(robot, world, goals, q_starts, key=key)``, or with a self-model, a
+    camera and Q goal images instead of the goals. Problem ``i`` uses the key ``fold_in(key, i)``;
+    each has one attempt. The search times reported hold the search of the whole batch. On a CPU a
+    loop over :func:`plan` is as fast; on other devices the batch pays.
+
+    Args:
+        robot: from :func:`load_robot`.
+        world: for this robot.
+        goals: Q goals that differ in numbers only, such as image goals of one camera.
+        inputs: ``q_starts``, unless it is given by name.
+        q_starts: (Q, D) start configurations.
+        key: random key.
+        planner: see :func:`plan`.
+        config: settings, the default ones if None.
+        on_progress: called with the batched search state and the seconds so far.
+
+    Raises:
+        ValueError: an input makes no sense; the message names the problem.
+    """
+    inputs = inputs if q_starts is None else (*inputs, q_starts)
+    if isinstance(goals, SelfModel):
+        camera, images, *rest = _counted(inputs, "camera", "goal_images", "q_starts")
+        inputs = tuple(rest)
+        goals = [ImageGoal(goals, camera, image) for image in images]
+    (all_starts,) = _counted(inputs, "q_starts")
+    config = PlannerConfig() if config is None else config
+    check_config(config)
+    if len(goals) != len(all_starts) or len(goals) == 0:
+        raise ValueError(
+            f"got {len(goals)} goals and {len(all_starts)} starts; expected as many, and one at "
+            "least"
         )
-        score, payload = policy.root(world, start)
-        tree = trees.create(start[None], score[None], payload, config.capacity)
-        stop_score = -1.0 if policy.star else 1e-4
-    else:
-        raise ValueError(f"unknown planner '{planner}'; have: rrt, rrt-star, rrt-connect")
-    stop = make_termination(stop_score, max_iterations=config.max_iterations)
+    starts: list[np.ndarray] = []
+    problems: list[VisualProblem] = []
+    for i, (goal, q_start) in enumerate(zip(goals, all_starts, strict=True)):
+        try:
+            if not isinstance(goal, ImageGoal):
+                check_goal(goal)
+            starts.append(checks.check_start(robot, world, q_start))
+            problems.append(make_problem(robot, goal, starts[-1], config))
+        except ValueError as error:
+            raise ValueError(f"problem {i}: {error}") from None
+    policy = _policy(planner, goals[0], config)
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(starts)))
+    with interruptible():
+        trees, compile_s, seed_s = zip(
+            *(
+                _seeded_tree(world, problem, policy, q_start[None], own_key, config)
+                for problem, q_start, own_key in zip(problems, starts, keys, strict=True)
+            ),
+            strict=True,
+        )
+        terminations = [_termination(config, policy, problem.goal) for problem in problems]
+        found = search(
+            world,
+            _stack([problem.goal for problem in problems]),
+            policy,
+            _stack(trees),
+            key=keys,
+            termination=_stack(terminations),
+            time_limit_s=time_left(config, sum(seed_s)).budget.time_limit_s,
+            batched=True,
+            on_progress=on_progress,
+        )
+        results = []
+        for i, (q_start, problem) in enumerate(zip(starts, problems, strict=True)):
+            own = dataclasses.replace(
+                found,
+                tree=jax.tree.map(lambda leaf: leaf[i], found.tree),  # noqa: B023 - used at once
+                stopped=found.stopped_each[i],
+                compile_s=found.compile_s + sum(compile_s),
+                search_s=found.search_s + seed_s[i],
+            )
+            results.append(finish_visual(robot, world, problem, own, q_start, keys[i], config))
+    return results
+
+
+def _plan_to_configuration(
+    robot: Robot,
+    world: World,
+    goal: ConfigurationGoal,
+    policy: ExpansionPolicy,
+    roots: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+    on_progress: Progress,
+) -> PlanResult:
+    """Search, extract the policy's path, shorten and verify it."""
     found = search(
         world,
+        goal,
         policy,
-        tree,
+        policy.init(world, goal, roots, config.tree.capacity),
         key=key,
-        stop=stop,
-        time_limit_s=config.time_limit_s,
+        termination=make_termination(
+            policy.goal_score(goal), max_iterations=config.budget.max_iterations
+        ),
+        time_limit_s=config.budget.time_limit_s,
         on_progress=on_progress,
     )
-    path = connection_path(found.tree) if planner == "rrt-connect" else tree_path(found.tree)
-    loss = float(jnp.min(found.tree.score))
-    goal_loss = max(stop_score, 1e-4)
-    result = finish(robot, world, found, path, q_goal, loss, goal_loss, key, config, q_start)
+    path = policy.extract_path(found.tree)
+    end = roots[0] if path is None else path[-1]
+    chosen = Chosen(
+        path=path,
+        target=np.asarray(goal.q),
+        loss=float(goal.loss(world, jnp.asarray(end))),
+        threshold=float(goal.threshold),
+    )
+    result = finish(robot, world, found, chosen, roots[0], key, config)
     if path is None:
-        result = dataclasses.replace(result, status=STATUS_OF[found.stopped])
+        status = STATUS_OF.get(found.stopped, Status.NO_PATH)
+        result = dataclasses.replace(result, status=status, advice=ADVICE[status])
     return result
 
 
+def _plan_by_loss(
+    robot: Robot,
+    world: World,
+    problem: VisualProblem,
+    policy: ExpansionPolicy,
+    roots: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+    on_progress: Progress,
+) -> PlanResult:
+    """Attempts from different seeds, until one is solved; the best of them."""
+    with interruptible():
+        result = _attempt(robot, world, problem, policy, roots, key, config, on_progress)
+        for again in range(1, config.budget.attempts):
+            rest = time_left(config, result.timing["search_s"])
+            if result.status not in RETRYABLE or rest.budget.time_limit_s == 0:
+                break
+            key = jax.random.fold_in(key, SEED_KEY - again)
+            other = _attempt(robot, world, problem, policy, roots, key, rest, on_progress)
+            if other.status in ABORTED and not other.ok:
+                # It ended before its loss could be compared with the other's.
+                best = dataclasses.replace(result, status=other.status, advice=other.advice)
+            else:
+                best = min(result, other, key=lambda r: (not r.ok, r.loss))
+            result = with_time_of(best, result, other)
+    return result
+
+
+def _attempt(
+    robot: Robot,
+    world: World,
+    problem: VisualProblem,
+    policy: ExpansionPolicy,
+    roots: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+    on_progress: Progress,
+) -> PlanResult:
+    """Sample seeds around the start (the first of the roots), search and finish, once."""
+    tree, compile_s, seed_s = _seeded_tree(world, problem, policy, roots, key, config)
+    found = search(
+        world,
+        problem.goal,
+        policy,
+        tree,
+        key=key,
+        termination=_termination(config, policy, problem.goal),
+        time_limit_s=time_left(config, seed_s).budget.time_limit_s,
+        on_progress=on_progress,
+    )
+    found = dataclasses.replace(
+        found, compile_s=found.compile_s + compile_s, search_s=found.search_s + seed_s
+    )
+    return finish_visual(robot, world, problem, found, roots[0], key, config)
+
+
+def _seeded_tree(
+    world: World,
+    problem: VisualProblem,
+    policy: ExpansionPolicy,
+    roots: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+) -> tuple[Tree, float, float]:
+    """The forest before the search, and the seconds for its compilation and for itself."""
+    key = jax.random.fold_in(key, SEED_KEY)
+
+    def grow() -> Tree:
+        all_roots = seeded_roots(world, problem.seeds, roots, key)
+        return policy.init(world, problem.goal, all_roots, config.tree.capacity)
+
+    return timed(grow, sample_seeds, init_forest)
+
+
+def _termination(config: PlannerConfig, policy: ExpansionPolicy, goal: Goal) -> Any:
+    """When a search by loss ends."""
+    budget = config.budget
+    return make_termination(
+        policy.goal_score(goal),
+        settle_iterations=budget.settle_iterations,
+        max_iterations=budget.max_iterations,
+        patience=budget.patience,
+        min_improvement=budget.min_improvement,
+        min_ratio=budget.min_ratio,
+    )
+
+
+def _policy(
+    planner: str | ExpansionPolicy | None, goal: AnyGoal, config: PlannerConfig
+) -> ExpansionPolicy:
+    """The policy of a planner by name, or the object itself.
+
+    Raises:
+        ValueError: the name is unknown or not for such a goal, or the object is no policy.
+    """
+    has_configuration = isinstance(goal, ConfigurationGoal)
+    if planner is None:
+        planner = "rrt-connect" if has_configuration else VISUAL
+    if not isinstance(planner, str):
+        check_policy(planner)
+        return planner
+    if planner == VISUAL:
+        return VisualRRT.from_config(config)
+    if planner not in PLANNERS:
+        raise ValueError(f"unknown planner '{planner}'; have: {', '.join([*PLANNERS, VISUAL])}")
+    if not has_configuration:
+        raise ValueError(
+            f"planner '{planner}' needs a ConfigurationGoal, and the goal is a "
+            f"{type(goal).__name__}; expected planner '{VISUAL}'"
+        )
+    return PLANNERS[planner](lanes=config.tree.lanes)
+
+
+def _image_goal(
+    self_model: SelfModel, inputs: tuple[Any, ...], mask: Image | None
+) -> tuple[ImageGoal, tuple[Any, ...]]:
+    """The goal of the second form of :func:`plan`, and what follows it."""
+    camera, image, *rest = _counted(inputs, "camera", "goal_image", "q_start")
+    return ImageGoal(self_model, camera, image, mask), tuple(rest)
+
+
+def _counted(inputs: tuple[Any, ...], *names: str) -> tuple[Any, ...]:
+    if len(inputs) != len(names):
+        raise ValueError(f"got {len(inputs)} inputs after the goal; expected {', '.join(names)}")
+    return inputs
+
+
 def _stack(items: Sequence[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *items)

@@ -15,6 +15,7 @@ from vrrt_jax.splat.camera import camera_from_matrix, look_at
 from vrrt_jax.splat.images import read_image
 from vrrt_jax.splat.model import SelfModel, load_self_model
 from vrrt_jax.splat.types import Camera
+from vrrt_jax.visual.goal import ImageGoal
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -29,6 +30,11 @@ class Problem:
     goal_images: tuple[np.ndarray, ...]  # (H, W, 3 or 4) float32
     q_start: np.ndarray  # (D,)
     true_goal: np.ndarray | None  # (D,) for scoring alone; the planner never sees it
+
+    @property
+    def goal(self) -> ImageGoal:
+        """The robot should look like the goal images."""
+        return ImageGoal(self.self_model, self.cameras, self.goal_images)
 
 
 def problem_names() -> list[str]:

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 import vrrt_jax
-from vrrt_jax.config import PlannerConfig, PlanResult
+from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.edges import joint_error
 from vrrt_jax.core.files import replacing
+from vrrt_jax.core.result import PlanResult
 from vrrt_jax.core.shortcut import path_length
 from vrrt_jax.problems import Problem
 
@@ -26,13 +27,13 @@ def summary(
         "problem": problem.name,
         "robot": problem.robot.name,
         "status": result.status.name,
-        "advice": result.status.value,
+        "advice": result.advice,
         "verified": bool(check is not None and check.ok),
         "verified_with": check.geometry if check is not None else None,
         "contact": check.contact if check is not None else None,
         "clearance_m": _number(check.clearance) if check is not None else None,
         "loss": result.loss,
-        "goal_loss": result.goal_loss,
+        "goal_loss": result.match_threshold,
         "cost": result.cost,
         "raw_cost": path_length(problem.world, result.raw_path),
         "q_goal": np.round(result.q_goal.astype(float), 6).tolist(),
@@ -46,7 +47,7 @@ def summary(
             "rejected": dict(result.rejected),
         },
         "seed": seed,
-        "config": {k: _number(v) for k, v in dataclasses.asdict(config).items()},
+        "config": _plain(dataclasses.asdict(config)),
         "versions": versions(),
     }
     if problem.true_goal is not None:
@@ -81,3 +82,11 @@ def save_result(
 def _number(value: Any) -> Any:
     """NaN and infinity have no place in JSON."""
     return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _plain(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings by stage, ready for JSON."""
+    return {
+        name: _plain(value) if isinstance(value, dict) else _number(value)
+        for name, value in settings.items()
+    }

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from vrrt_jax.core.edges import difference
-from vrrt_jax.planner import PlanResult
+from vrrt_jax.core.result import PlanResult
 from vrrt_jax.problems import Problem
 from vrrt_jax.robots import Robot
 from vrrt_jax.robots.kinematics import link_poses
@@ -44,10 +44,11 @@ class ScenePainter:
         """The scene at ``q``: (H, W, 3) uint8."""
         if self._meshes is not None:
             return self._meshes.scene(q, self._camera)
-        rgb, coverage, depth = (np.asarray(x) for x in self._robot(jnp.asarray(q, jnp.float32)))
-        alpha = np.where(depth < self._depth, coverage, 0.0)[..., None]
-        straight = rgb / np.maximum(coverage, 1e-3)[..., None]
-        mixed = (1 - alpha) * self._background + alpha * straight
+        rgb, alpha, depth = (np.asarray(x) for x in self._robot(jnp.asarray(q, jnp.float32)))
+        straight = rgb / np.maximum(alpha, 1e-3)[..., None]
+        # An obstacle that is nearer than the robot hides it.
+        visible = np.where(depth < self._depth, alpha, 0.0)[..., None]
+        mixed = (1 - visible) * self._background + visible * straight
         return np.round(255 * np.clip(mixed, 0, 1)).astype(np.uint8)
 
 
@@ -66,19 +67,19 @@ def _mesh_renderer(robot: Robot, world: World) -> Any:
 
 
 def _splat_layers(splats: SplatModel, robot: Robot, camera: Camera, q: jax.Array):
-    """Color over black, coverage and depth of the robot."""
+    """Color over black, alpha and depth of the robot."""
     poses = link_poses(robot.chain, q)
-    rgb, coverage = render(splats, poses, camera)
+    rgb, alpha = render(splats, poses, camera)
     pose = poses[splats.link]
     points = jnp.einsum("gij,gj->gi", pose[:, :3, :3], splats.mean) + pose[:, :3, 3]
     _, depth = project(camera, points)
-    as_colour = dataclasses.replace(
+    depth_as_rgb = dataclasses.replace(
         splats,
         rgb=jnp.repeat(depth[:, None], 3, axis=1),
         view_color_gradient=jnp.zeros_like(splats.view_color_gradient),
     )
-    weighted, _ = render(as_colour, poses, camera)
-    return rgb, coverage, weighted[..., 0] / jnp.maximum(coverage, 1e-3)
+    weighted, _ = render(depth_as_rgb, poses, camera)
+    return rgb, alpha, weighted[..., 0] / jnp.maximum(alpha, 1e-3)
 
 
 def _draw_obstacles(world: World, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -207,13 +208,13 @@ def _draw_images(figure, grid, problem: Problem, result: PlanResult) -> None:
     painter = ScenePainter(problem.robot, problem.world, problem.self_model, camera)
     splats = problem.self_model.level_for(camera.height).splats
     end = link_poses(problem.robot.chain, jnp.asarray(result.q_goal, jnp.float32))
-    rgb, coverage = (np.asarray(a) for a in jax.jit(render)(splats, end, camera))
-    goal_rgb, goal_coverage = np.asarray(goal.rgb[0]), np.asarray(goal.coverage[0])
-    apart = np.abs(rgb - goal_rgb).mean(-1) + np.abs(coverage - goal_coverage)
+    rgb, alpha = (np.asarray(a) for a in jax.jit(render)(splats, end, camera))
+    goal_rgb, goal_alpha = np.asarray(goal.rgb[0]), np.asarray(goal.alpha[0])
+    apart = np.abs(rgb - goal_rgb).mean(-1) + np.abs(alpha - goal_alpha)
     panels = (
         ("start", painter.paint(result.path[0])),
-        ("goal image", goal_rgb + SKY * (1 - goal_coverage[..., None])),
-        ("end, as the self-model sees it", rgb + SKY * (1 - coverage[..., None])),
+        ("goal image", goal_rgb + SKY * (1 - goal_alpha[..., None])),
+        ("end, as the self-model sees it", rgb + SKY * (1 - alpha[..., None])),
         ("difference", apart),
     )
     for column, (title, picture) in enumerate(panels):
@@ -230,7 +231,7 @@ def _draw_loss(axes, result: PlanResult) -> None:
     history = result.history
     axes.semilogy(history[:, 0], history[:, 2], color="tab:blue", label="best loss in the tree")
     axes.axhline(
-        result.search_goal_loss, color="tab:green", ls="--", lw=1, label="counts as matched"
+        result.search_match_threshold, color="tab:green", ls="--", lw=1, label="counts as matched"
     )
     axes.set_xlabel("iteration of the search")
     axes.set_ylabel("image loss")

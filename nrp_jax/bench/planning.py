@@ -13,11 +13,11 @@ import numpy as np
 from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning.data import Settings, home_seed
 from nrp_jax.learning.difficulty import EXPANSIONS, MIN_GEODESIC, fair_house, long_queries
-from nrp_jax.planner import KINDS, METHODS, PlanResult, Status, plan
+from nrp_jax.planner import KINDS, PLANNERS, PlanResult, Status, plan
 from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.robots import MobileRobot, load_robot
 from nrp_jax.scene.world import GridWorld, build_world
-from vrrt_jax.core.search import uninterrupted
+from vrrt_jax.core.interrupt import uninterrupted
 from vrrt_jax.core.timing import machine
 
 
@@ -76,7 +76,7 @@ def run(
                     start,
                     goal,
                     key=jax.random.key(home.seed + index),
-                    method=method,
+                    planner=method,
                     sampler=sampler,
                     world=home.world,
                     scene=home.scene,
@@ -102,7 +102,7 @@ def add_arguments(subparsers: Any) -> None:
     parser = subparsers.add_parser("plan", help="success on unseen homes at some expansions")
     parser.set_defaults(run=_run_command)
     parser.add_argument("--task", default="snake", choices=tuple(CELLS), help="whose homes")
-    parser.add_argument("--methods", default=",".join(METHODS), help="some of the default's")
+    parser.add_argument("--methods", default=",".join(PLANNERS), help="some of the default's")
     parser.add_argument("--homes", type=int, default=5, help="unseen ones")
     parser.add_argument("--queries", type=int, default=10, help="of a home")
     parser.add_argument("--max-expansions", type=int, default=EXPANSIONS, help="of a plan")
@@ -120,9 +120,9 @@ def _run_command(arguments: argparse.Namespace) -> int:
     from nrp_jax.samplers import load_sampler
 
     methods = arguments.methods.split(",")
-    unknown = [method for method in methods if method not in METHODS]
+    unknown = [method for method in methods if method not in PLANNERS]
     if unknown:
-        raise ValueError(f"unknown method '{unknown[0]}'; have: {', '.join(METHODS)}")
+        raise ValueError(f"unknown method '{unknown[0]}'; have: {', '.join(PLANNERS)}")
     for name in ("homes", "queries", "max_expansions", "lanes"):
         if getattr(arguments, name) < 1:
             raise ValueError(f"{name} is {getattr(arguments, name)}; expected at least 1")

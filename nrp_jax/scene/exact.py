@@ -4,13 +4,12 @@ Nothing here shares code with the distances and spheres that the planners comput
 there cannot hide itself.
 """
 
-import dataclasses
-
 import mujoco
 import numpy as np
 
 from nrp_jax.homes.grid import Grid
 from nrp_jax.scene.robots import MobileRobot
+from vrrt_jax.core.result import Verification
 
 STEP = 0.02  # [m] and [rad], largest distance between configurations of a trajectory, by joint
 _WALL = 1.0  # [m] thickness of what stands around the map
@@ -20,15 +19,6 @@ _STEP_TOLERANCE = 1e-4  # [rad] or [m]
 _SLIDE_TOLERANCE = 3e-3  # [m] a base that drives like a car may slide sideways in a step
 # Contact bits: of the home's cells and of its floor; the robot's file says what sees which.
 _CELL_BIT, _FLOOR_BIT = 4, 8
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Verification:
-    """What :func:`verify` found."""
-
-    ok: bool  # inside the limits, and free all the way
-    checked: int  # number of configurations checked
-    contact: str | None  # the first violation, such as "link3 touches the map at 37 % of the path"
 
 
 class ExactScene:

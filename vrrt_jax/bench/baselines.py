@@ -19,16 +19,16 @@ import numpy as np
 import optax
 
 from vrrt_jax import checks
-from vrrt_jax.config import PlannerConfig
-from vrrt_jax.core.edges import enforce_bounds, joint_error
+from vrrt_jax.config import Budget, PlannerConfig, TreeConfig
+from vrrt_jax.core.edges import joint_error
 from vrrt_jax.core.types import pytree
 from vrrt_jax.planner import plan_to_configuration
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.world import World, batch_is_free
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera
-from vrrt_jax.visual.goal import Sight, visual_policy
-from vrrt_jax.visual.policy import VisualPolicy
+from vrrt_jax.visual.descent import adam_descent
+from vrrt_jax.visual.goal import ImageGoal, ImageObjective
 
 WIDTH, DEPTH, JOINT_FEATURES = 128, 4, 8  # of the classifier; the paper's is 512 wide
 SAMPLES = 200_000  # labeled configurations; the paper has 10 million
@@ -55,7 +55,7 @@ class BaselineResult:
 
     path: np.ndarray  # (P, D)
     loss: float  # image loss of its end
-    goal_loss: float  # at or below which the image is matched
+    match_threshold: float  # at or below which the image is matched
     found_path: bool  # False if there was an estimate of the goal, but no way to it
     search_s: float  # without compilation
 
@@ -172,10 +172,11 @@ def dr_robot(
     """
     config = config or ChainConfig()
     q_start = checks.check_start(robot, world, q_start)
-    sight = Sight(robot, self_model, camera, goal_image, mask)
-    policy, goal_loss = visual_policy(sight, q_start, PlannerConfig())
+    checks.check_self_model(robot, self_model)
+    goal = ImageGoal(self_model, camera, goal_image, mask).at(robot, TreeConfig().image_px)
+    checks.check_cameras(robot, goal.splats, goal.cameras, q_start)
     numbers = jnp.float32([config.alpha, config.beta1, config.beta2])
-    run = functools.partial(_chain, world, policy, classifier, jnp.asarray(q_start), numbers)
+    run = functools.partial(_chain, world, goal, classifier, jnp.asarray(q_start), numbers)
     jax.block_until_ready(run(1))
     started = time.perf_counter()
     q, losses = (np.asarray(a) for a in run(config.steps))
@@ -183,36 +184,44 @@ def dr_robot(
     return BaselineResult(
         path=q[: best + 1],
         loss=float(losses[best]),
-        goal_loss=goal_loss,
+        match_threshold=float(goal.threshold),
         found_path=True,
         search_s=time.perf_counter() - started,
     )
 
 
 @jax.jit
-def _chain(world, policy: VisualPolicy, classifier, q, numbers, steps):
+def _chain(world, goal: ImageObjective, classifier, q, numbers, steps):
     """Configurations (MAX_STEPS, D) and image losses; those beyond ``steps`` are infinite."""
     alpha, beta1, beta2 = numbers
-    adam = optax.scale_by_adam(b1=beta1, b2=beta2, eps=1e-8)
 
     def objective(q):
-        loss = policy.loss(world, q)
+        loss = goal.loss(world, q)
         total = IMAGE_SCALE * loss
         if classifier is not None:
             total += PENALTY * jax.nn.relu(classifier(q) + PENALTY_MARGIN)
         return total, loss
 
-    def step(i, carry):
-        q, state, path, losses = carry
-        (_, loss), gradient = jax.value_and_grad(objective, has_aux=True)(q)
-        path, losses = path.at[i].set(q), losses.at[i].set(loss)
-        direction, state = adam.update(gradient, state)
-        return enforce_bounds(world, q - alpha * direction), state, path, losses
+    def gradient(q):
+        (_, loss), slope = jax.value_and_grad(objective, has_aux=True)(q)
+        return slope, loss
 
-    path = jnp.zeros((MAX_STEPS, len(q)))
-    losses = jnp.full(MAX_STEPS, jnp.inf)
-    carry = jax.lax.fori_loop(0, steps, step, (q, adam.init(q), path, losses))
-    return carry[2], carry[3]
+    def observe(seen, i, q, loss):
+        path, losses = seen
+        return path.at[i].set(q), losses.at[i].set(loss)
+
+    _, seen = adam_descent(
+        world,
+        gradient,
+        q,
+        steps=steps,
+        step_size=lambda i: alpha,
+        beta1=beta1,
+        beta2=beta2,
+        observe=observe,
+        seen=(jnp.zeros((MAX_STEPS, len(q))), jnp.full(MAX_STEPS, jnp.inf)),
+    )
+    return seen
 
 
 def rrt_star_to_estimate(
@@ -237,14 +246,14 @@ def rrt_star_to_estimate(
         q_goal,
         key=key,
         planner="rrt-star",
-        config=PlannerConfig(max_iterations=iterations),
+        config=PlannerConfig(budget=Budget(max_iterations=iterations)),
     )
     reached = len(found.path) > 1 or np.allclose(q_start, q_goal, atol=1e-3)
     reached &= bool(np.linalg.norm(joint_error(world, found.path[-1], q_goal)) < 1e-2)
     return BaselineResult(
         path=found.path,
         loss=estimate.loss,
-        goal_loss=estimate.goal_loss,
+        match_threshold=estimate.match_threshold,
         found_path=reached,
         search_s=estimate.search_s + found.timing["search_s"] + found.timing["shortcut_s"],
     )

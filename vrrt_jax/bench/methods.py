@@ -98,14 +98,7 @@ def solve(
     task_seed = zlib.crc32(f"{seed} {task.level:.3f} {task.index}".encode())
     key = jax.random.key(task_seed)
     self_model = _self_model(robot_name)
-    inputs = (
-        robot,
-        world,
-        self_model,
-        cameras(robot_name, scenery),
-        images,
-        task.q_start,
-    )
+    inputs = (robot, world, self_model, cameras(robot_name, scenery), images, task.q_start)
     started = time.perf_counter()
     if method == "vrrt":
         noise = np.random.default_rng(task_seed).normal(size=robot.num_joints)
@@ -127,7 +120,7 @@ def solve(
         reference = _reference_length(robot, world, task, key)
     if not success:
         # The meshes look more alike in the two poses than the self-model is like the meshes.
-        alike = psnr_db >= self_model.level_for(config.polish_px).psnr_db
+        alike = psnr_db >= self_model.level_for(config.polish.px).psnr_db
         known = reference is not None or not collisions
         cause = _cause(attempt, right=right, valid=valid, alike=alike, known=known)
     return {
@@ -172,7 +165,7 @@ def _plan(inputs, key, config: PlannerConfig, masks, guess) -> Attempt:
     times = result.timing
     return Attempt(
         path=result.path if result.status is not Status.NO_PATH else result.target[None],
-        matched=result.loss <= result.goal_loss,
+        matched=result.loss <= result.match_threshold,
         has_path=result.status is not Status.NO_PATH,
         out_of_time=result.status is Status.TIME_LIMIT,
         loss=result.loss,
@@ -189,7 +182,7 @@ def _baseline(inputs, robot_name: str, task: Task, method: str, key, masks) -> A
         found = baselines.rrt_star_to_estimate(inputs[0], inputs[1], found, key=key)
     return Attempt(
         path=found.path,
-        matched=found.loss <= found.goal_loss,
+        matched=found.loss <= found.match_threshold,
         has_path=found.found_path,
         out_of_time=False,
         loss=found.loss,

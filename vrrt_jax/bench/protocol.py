@@ -1,6 +1,5 @@
 """The benchmarks by name: the paper's tasks, pose reconstruction, the ablations."""
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -13,26 +12,26 @@ from vrrt_jax.config import PlannerConfig
 # the default, what it does and the paper does not: each is taken away, after the whole.
 ABLATIONS = {
     "paper": {
-        "exploration": (0.1, 0.3, 0.5, 0.7, 0.9),
-        "eta": (0.0, 0.2, 0.4, 0.6, 0.8, 1.0),
-        "kappa": (0.5, 0.8, 0.9, 0.95, 0.99),
-        "beta1": (0.5, 0.9, 0.99),
-        "beta2": (0.9, 0.999),
-        "lanes": (8, 32, 128),
-        "inherit": (True, False),
+        "expand.exploration": (0.1, 0.3, 0.5, 0.7, 0.9),
+        "expand.eta": (0.0, 0.2, 0.4, 0.6, 0.8, 1.0),
+        "expand.kappa": (0.5, 0.8, 0.9, 0.95, 0.99),
+        "expand.beta1": (0.5, 0.9, 0.99),
+        "expand.beta2": (0.9, 0.999),
+        "tree.lanes": (8, 32, 128),
+        "expand.inherit": (True, False),
     },
     "default": {
-        "probes": (1024, 256, 0),
-        "probe_rounds": (0,),
-        "probe_steps": (0,),
-        "hypotheses": (0, 1),
-        "polish_rounds": (1,),
-        "close_px": (0,),
-        "start_prior": (0.0,),
-        "start_preference": (0.0,),
-        "anneal": (0.0,),
-        "attempts": (1,),
-        "settle": (0,),
+        "seeds.num": (1024, 256, 0),
+        "seeds.rounds": (0,),
+        "seeds.steps": (0,),
+        "polish.hypotheses": (0, 1),
+        "polish.rounds": (1,),
+        "polish.close_px": (0,),
+        "polish.start_prior": (0.0,),
+        "match.start_preference": (0.0,),
+        "expand.anneal": (0.0,),
+        "budget.attempts": (1,),
+        "budget.settle_iterations": (0,),
     },
 }
 GUESS_SIGMAS = (0.05, 0.10, 0.15, 0.20)  # [rad]
@@ -72,7 +71,7 @@ def benchmark(
         ("robot", robot, ROBOTS),
         ("method", method, METHODS),
         ("config", config, CONFIGS),
-        ("ablation", only, (None, *ABLATIONS.get(config, ()), "guess")),
+        ("ablation", only, (None, *map(_short, ABLATIONS.get(config, ())), "guess")),
     ):
         if value not in known:
             names = ", ".join(str(n) for n in known if n is not None)
@@ -82,8 +81,9 @@ def benchmark(
             f"got levels {list(levels)} and {tasks_per_level} tasks a level; expected distances "
             "above 0 and at least one task"
         )
-    make = PlannerConfig.paper if config == "paper" else PlannerConfig
-    base = Variant(name=method, method=method, config=make(time_limit_s=time_limit_s))
+    settings = PlannerConfig.paper() if config == "paper" else PlannerConfig()
+    settings = settings.changed({"budget.time_limit_s": time_limit_s})
+    base = Variant(name=method, method=method, config=settings)
     return Benchmark(
         what=what,
         robot=robot,
@@ -97,9 +97,9 @@ def benchmark(
 
 def _ablations(config: str, only: str | None, base: PlannerConfig) -> tuple[Variant, ...]:
     variants = [
-        Variant(name=f"{field}={value}", config=dataclasses.replace(base, **{field: value}))
-        for field, values in ABLATIONS[config].items()
-        if only in (None, field)
+        Variant(name=f"{_short(name)}={value}", config=base.changed({name: value}))
+        for name, values in ABLATIONS[config].items()
+        if only in (None, _short(name))
         for value in values
     ]
     if only in (None, "guess"):
@@ -107,3 +107,9 @@ def _ablations(config: str, only: str | None, base: PlannerConfig) -> tuple[Vari
             Variant(name=f"guess={sigma}", config=base, guess_sigma=sigma) for sigma in GUESS_SIGMAS
         ]
     return tuple(variants)
+
+
+def _short(name: str) -> str:
+    """A setting of the paper's own by its symbol, ``eta``; others with their stage."""
+    stage, _, last = name.partition(".")
+    return last if stage in ("expand", "tree") else name

@@ -10,10 +10,12 @@ from vrrt_jax.core.timing import interleaved_ms
 from vrrt_jax.robots import Robot, load_robot
 from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.splat.camera import look_at
+from vrrt_jax.splat.lanes import map_lanes
 from vrrt_jax.splat.loss import image_loss
-from vrrt_jax.splat.raster import choose_windows, map_lanes, render
+from vrrt_jax.splat.raster import render
 from vrrt_jax.splat.reference import render_reference
 from vrrt_jax.splat.types import SplatModel, layer_starts
+from vrrt_jax.splat.windows import choose_windows
 
 CHANNELS = 5  # what the rasterizer sums: weighted rgb, weight and density
 
@@ -36,9 +38,9 @@ def run(
     splats, windows = choose_windows(whole, poses, camera)
 
     def loss(q, splats, draw, *options):
-        rgb, coverage = draw(splats, link_poses(robot.chain, q), camera, *options)
-        goal = jnp.full_like(coverage, 0.3)
-        return image_loss(rgb, coverage, goal[..., None], goal, jnp.ones_like(goal))
+        rgb, alpha = draw(splats, link_poses(robot.chain, q), camera, *options)
+        goal = jnp.full_like(alpha, 0.3)
+        return image_loss(rgb, alpha, goal[..., None], goal, jnp.ones_like(goal))
 
     def lanes(function, *options):
         return jax.jit(lambda q: map_lanes(lambda q: function(q, *options), q))
@@ -65,8 +67,8 @@ def run(
         "num_lanes": num_lanes,
         "num_splats": num_splats,
         "size_px": size_px,
-        "window_px": windows.px if windows else size_px,
-        "cluster": windows.cluster if windows else num_splats,
+        "window_px": windows.size_px if windows else size_px,
+        "cluster": windows.cluster_size if windows else num_splats,
         **{f"{name}_ms": round(value, 3) for name, value in times.items()},
         "compile_s": round(compile_s, 2),
         "ratio_to_floor": round(times["value_and_grad"] / times["floor"], 3),

@@ -18,7 +18,7 @@ from vrrt_jax.bench.tasks import Scenery, bench_robot, make_task
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.command import end_with_parent
 from vrrt_jax.core.files import replacing
-from vrrt_jax.core.search import uninterrupted
+from vrrt_jax.core.interrupt import uninterrupted
 from vrrt_jax.core.timing import machine
 from vrrt_jax.problems import self_model_path
 from vrrt_jax.report import versions

@@ -1,21 +1,22 @@
 """The visual search: what an iteration costs, and the packaged problems from start to end."""
 
-import dataclasses
 import resource
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax import planner
+from vrrt_jax.config import Budget, PlannerConfig
 from vrrt_jax.core.edges import free_prefix, joint_error
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.search import make_termination, search
 from vrrt_jax.core.timing import interleaved_ms
 from vrrt_jax.core.types import Expansion
+from vrrt_jax.planner import plan
 from vrrt_jax.problems import Problem, load_problem, problem_names
-from vrrt_jax.visual.goal import Sight, visual_setup
-from vrrt_jax.visual.policy import plant
+from vrrt_jax.visual.policy import VisualRRT
+from vrrt_jax.visual.problem import make_problem
+from vrrt_jax.visual.seeds import seeded_roots
 
 
 def run(repeats: int = 15, seeds: int = 3) -> dict:
@@ -29,23 +30,22 @@ def run(repeats: int = 15, seeds: int = 3) -> dict:
 
 def iteration_split(problem: Problem, repeats: int = 15) -> dict:
     """Times of the parts of one iteration on a grown tree, each jitted by itself [ms]."""
-    config = planner.PlannerConfig()
-    sight = Sight(problem.robot, problem.self_model, problem.cameras, problem.goal_images)
-    setup = visual_setup(sight, problem.q_start, config)
-    policy = setup.policy
+    config = PlannerConfig()
+    visual = make_problem(problem.robot, problem.goal, problem.q_start, config)
+    policy, goal = VisualRRT.from_config(config), visual.goal
     world, key = problem.world, jax.random.key(0)
-    q_start = problem.q_start[None]
-    tree = plant(world, policy, setup.probing, q_start, key, config.capacity)
+    roots = seeded_roots(world, visual.seeds, problem.q_start[None], key)
     found = search(
         world,
+        goal,
         policy,
-        tree,
+        policy.init(world, goal, roots, config.tree.capacity),
         key=key,
-        stop=make_termination(-1.0, max_iterations=40),
+        termination=make_termination(-1.0, max_iterations=40),
         time_limit_s=60.0,
     )
     tree = found.tree
-    proposals = jax.jit(policy.propose)(world, tree, key)
+    proposals = jax.jit(policy.propose)(world, goal, tree, key)
     parents = tree.q[proposals.parent]
     size = tree.size - policy.lanes
     expansion = Expansion(
@@ -56,16 +56,16 @@ def iteration_split(problem: Problem, repeats: int = 15) -> dict:
     )
     # The arrays are arguments, as in the search: a closure would make them constants.
     parts = {
-        "iteration": (expand, (world, policy, tree, key)),
-        "gradient": (lambda p, w, *rest: p.evaluate(w, *rest), (policy, world, parents, proposals)),
-        "propose": (lambda p, *rest: p.propose(*rest), (policy, world, tree, key)),
+        "iteration": (expand, (world, goal, policy, tree, key)),
+        "gradient": (lambda p, *rest: p.evaluate(*rest), (policy, world, goal, parents, proposals)),
+        "propose": (lambda p, *rest: p.propose(*rest), (policy, world, goal, tree, key)),
         "edges": (
             lambda w, a, b: free_prefix(w, a, b, policy.edge_steps),
             (world, parents, proposals.target - parents),
         ),
         "rewire": (
             lambda p, *rest: p.after_insert(*rest),
-            (policy, world, tree, proposals, expansion),
+            (policy, world, goal, tree, proposals, expansion),
         ),
     }
     compiled = {name: (jax.jit(function), args) for name, (function, args) in parts.items()}
@@ -74,9 +74,9 @@ def iteration_split(problem: Problem, repeats: int = 15) -> dict:
     )
     return {
         "lanes": policy.lanes,
-        "num_splats": policy.splats.num_splats,
-        "image_px": list(policy.goal.coverage.shape[1:]),
-        "capacity": config.capacity,
+        "num_splats": goal.splats.num_splats,
+        "image_px": list(goal.image.alpha.shape[1:]),
+        "capacity": config.tree.capacity,
         "tree_nodes": int(tree.size),
         **{f"{name}_ms": round(value, 2) for name, value in times.items()},
         "iteration_over_gradient": round(times["iteration"] / times["gradient"], 3),
@@ -88,15 +88,13 @@ def iteration_split(problem: Problem, repeats: int = 15) -> dict:
 def _outcome(problem: Problem, seeds: int) -> dict:
     rows = []
     for seed in range(seeds):
-        result = planner.plan(
+        result = plan(
             problem.robot,
             problem.world,
-            problem.self_model,
-            problem.cameras,
-            problem.goal_images,
+            problem.goal,
             problem.q_start,
             key=jax.random.key(seed),
-            config=dataclasses.replace(planner.PlannerConfig(), time_limit_s=60.0),
+            config=PlannerConfig(budget=Budget(time_limit_s=60.0)),
         )
         error = np.nan
         if problem.true_goal is not None:

@@ -154,7 +154,7 @@ def goal_images(
     images, masks = [], []
     for camera in cameras(robot_name, scenery):
         picture = renderer.picture(task.q_goal, camera)
-        images.append(np.concatenate([picture.rgb, picture.coverage[..., None]], axis=-1))
+        images.append(np.concatenate([picture.rgb, picture.alpha[..., None]], axis=-1))
         masks.append(picture.valid)
     # The robot comes over black; a goal image has straight colors beside its mask.
     for image in images:
@@ -181,7 +181,7 @@ def image_psnr(robot_name: str, q: np.ndarray, images: list[np.ndarray], scenery
     errors = []
     for camera, image in zip(cameras(robot_name, scenery), images, strict=True):
         picture = renderer.picture(q, camera)
-        over_white = picture.rgb + 1.0 - picture.coverage[..., None]
+        over_white = picture.rgb + 1.0 - picture.alpha[..., None]
         goal = image[..., :3] * image[..., 3:] + 1.0 - image[..., 3:]
         errors.append(np.mean((over_white - goal) ** 2))
     return float(-10.0 * np.log10(max(np.mean(errors), 1e-10)))

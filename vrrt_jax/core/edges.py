@@ -54,6 +54,10 @@ class Space(Protocol):
         """The edge towards a target inside the limits, cut to what ``num_steps`` can check."""
         ...
 
+    def span(self, edge: Edge) -> jax.Array:
+        """How far (...) an edge goes, in the units of ``resolution``."""
+        ...
+
     def is_resolved(self, edge: Edge, num_steps: int | jax.Array) -> jax.Array:
         """Whether (...) ``num_steps`` sub-steps are fine enough for an edge."""
         ...
@@ -106,9 +110,13 @@ class StraightLineEdges:
         """See :class:`Space`."""
         return steer(self, q_from, target, num_steps * self.resolution)
 
+    def span(self, edge: jax.Array) -> jax.Array:
+        """See :class:`Space`; the length of a straight edge."""
+        return self.length(edge)
+
     def is_resolved(self, edge: jax.Array, num_steps: int | jax.Array) -> jax.Array:
         """See :class:`Space`."""
-        return self.length(edge) <= num_steps * self.resolution
+        return self.span(edge) <= num_steps * self.resolution
 
     def truncate(self, edge: jax.Array, fraction: jax.Array) -> jax.Array:
         """See :class:`Space`."""
@@ -185,11 +193,6 @@ def steer(
     step = jnp.where(world.is_continuous, step, inside)
     length = jnp.sqrt(jnp.sum(step**2, axis=-1, keepdims=True))
     return step * jnp.minimum(1.0, max_length / jnp.maximum(length, 1e-12))
-
-
-def free_steps(world: Space, q_from: jax.Array, q_to: jax.Array, num_steps: int) -> jax.Array:
-    """How far one can go from one configuration to another: see :func:`free_prefix`."""
-    return free_prefix(world, q_from, world.edge(q_from, q_to), num_steps)
 
 
 def free_prefix(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) -> jax.Array:

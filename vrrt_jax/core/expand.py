@@ -1,6 +1,7 @@
 """One iteration: B expansions of a tree, for every planner."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,63 +14,78 @@ SHORTEST_EDGE = 1e-5  # [rad] a shorter step would only duplicate its parent
 
 
 def expand(
-    world: Space, policy: ExpansionPolicy[Payload], tree: Tree[Payload], key: jax.Array
+    world: Space, goal: Any, policy: ExpansionPolicy[Payload], tree: Tree[Payload], key: jax.Array
 ) -> Tree[Payload]:
     """Propose, steer, check edges, filter, evaluate, insert, and let the policy follow up.
 
     Args:
         world: robot and obstacles.
+        goal: where to; handed to the policy.
         policy: the planner.
         tree: the tree to grow.
         key: the search's key; the iteration's own is folded in here, so that results do not depend
             on how iterations are grouped into chunks.
     """
-    proposals = policy.propose(world, tree, jax.random.fold_in(key, tree.iteration))
+    # Propose: a parent and a target for every lane. Lanes without either stand in at node 0.
+    proposals = policy.propose(world, goal, tree, jax.random.fold_in(key, tree.iteration))
     parent = jnp.where(proposals.valid, proposals.parent, 0)
     q_from = tree.q[parent]
+
+    # Steer: the edge towards the target, inside the limits and short enough to be checked.
     edge = world.steer(q_from, proposals.target, policy.edge_steps)
 
-    passed = free_prefix(world, q_from, edge, policy.edge_steps)
-    free = (passed == policy.edge_steps) | (proposals.partial & (passed > 0))
-    edge = world.truncate(edge, passed / policy.edge_steps)
+    # Check edges: how many leading sub-steps are free. A blocked edge is cut there, or given up.
+    num_free = free_prefix(world, q_from, edge, policy.edge_steps)
+    free = (num_free == policy.edge_steps) | (proposals.partial & (num_free > 0))
+    edge = world.truncate(edge, num_free / policy.edge_steps)
     length = world.length(edge)
     q = world.normalize(world.end(q_from, edge))
 
-    # A NaN target gives a NaN length: caught as not finite, before it can look like a limit.
+    # Filter and evaluate. A NaN target gives a NaN length: it is caught as not finite, before it
+    # can look like a limit. Rejected lanes are evaluated at their parents, where nothing is NaN.
     finite = jnp.isfinite(length)
     candidate = proposals.valid & finite & free & (length > SHORTEST_EDGE)
-    score, payload = policy.evaluate(world, jnp.where(candidate[:, None], q, q_from), proposals)
+    q_evaluated = jnp.where(candidate[:, None], q, q_from)
+    score, payload = policy.evaluate(world, goal, q_evaluated, proposals)
     finite &= jnp.isfinite(score)
     for leaf in jax.tree.leaves(payload):
         finite &= jnp.all(jnp.isfinite(leaf.reshape(leaf.shape[0], -1)), axis=1)
 
+    # Insert, and count the lanes that were lost.
     tree_before = tree
-    tree, slot = trees.insert(
+    tree, node_index = trees.insert(
         tree,
         q=q,
         parent=parent,
         cost=tree.cost[parent] + length,
         score=score,
         payload=payload,
-        ok=candidate & finite,
+        valid=candidate & finite,
     )
-    accepted = slot < tree.capacity
-    reasons = (  # the first that holds, in the order of Rejection
+    accepted = node_index < tree.capacity
+    rejected = _count_reasons(  # in the order of Rejection
         ~proposals.valid,
         finite & free & (length <= SHORTEST_EDGE),
         finite & ~free,
         ~finite,
         ~accepted,
     )
-    rejected = jnp.zeros_like(tree.rejected)
-    counted = jnp.zeros_like(accepted)
-    for reason, lanes in zip(Rejection, reasons, strict=True):
-        rejected = rejected.at[reason].set(jnp.sum(lanes & ~counted))
-        counted |= lanes
     tree = dataclasses.replace(
         tree, iteration=tree_before.iteration + 1, rejected=tree_before.rejected + rejected
     )
+
+    # Follow up: the policy's own book-keeping, with all children in the tree.
     expansion = Expansion(
-        q=q, node_index=slot, accepted=accepted, blocked=passed < policy.edge_steps
+        q=q, node_index=node_index, accepted=accepted, blocked=num_free < policy.edge_steps
     )
-    return policy.after_insert(world, tree, proposals, expansion)
+    return policy.after_insert(world, goal, tree, proposals, expansion)
+
+
+def _count_reasons(*reasons: jax.Array) -> jax.Array:
+    """Lanes (len(Rejection),) i32 by the first of the reasons (B,) that holds for them."""
+    counts = jnp.zeros(len(Rejection), jnp.int32)
+    counted = jnp.zeros_like(reasons[0])
+    for reason, lanes in zip(Rejection, reasons, strict=True):
+        counts = counts.at[reason].set(jnp.sum(lanes & ~counted))
+        counted |= lanes
+    return counts

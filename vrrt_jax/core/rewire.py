@@ -1,6 +1,6 @@
 """RRT*: choose the cheapest parent for new nodes, and let them adopt others.
 
-A batch is rewired at once, on the costs before it: a parent is adopted only if that makes a node
+A batch is rewired at once, on the costs before it. A parent is adopted only if that makes a node
 strictly cheaper, and costs grow along every branch, so no two adoptions can close a cycle. In a
 forest this also joins trees: their roots, but for the first, may be adopted like any node.
 """
@@ -45,24 +45,30 @@ def rewire(
     Returns:
         The tree with new parents, and costs that are right for all nodes.
     """
+    # Which old nodes (B, N) are near which new ones. Rejected lanes stand in at node 0.
     radius = jnp.minimum(radius, edge_steps * world.resolution)
-    apart = trees.distances(world, tree, expansion.q)
+    distances = trees.distances(world, tree, expansion.q)
     is_old = jnp.arange(tree.capacity) < tree.size - jnp.sum(expansion.accepted)
-    near = expansion.accepted[:, None] & is_old & (apart < radius)
+    near = expansion.accepted[:, None] & is_old & (distances < radius)
     new = jnp.where(expansion.accepted, expansion.node_index, 0)
 
-    via = jnp.where(near, tree.cost + apart, jnp.inf)
-    best, cost_via = jnp.argmin(via, axis=1), jnp.min(via, axis=1)
+    # Choose parents: the old node through which a new one costs least, if the edge is free.
+    # Writes to slot N are dropped: that is how lanes without a better parent write nothing.
+    cost_through_old = jnp.where(near, tree.cost + distances, jnp.inf)
+    best, cost_via = jnp.argmin(cost_through_old, axis=1), jnp.min(cost_through_old, axis=1)
     lane, better = _largest(tree.cost[new] - cost_via, checks)
     better &= _edge_is_free(world, tree.q[best[lane]], expansion.q[lane], edge_steps)
     slot = jnp.where(better, expansion.node_index[lane], tree.capacity)
     parent = tree.parent.at[slot].set(best[lane].astype(jnp.int32), mode="drop")
     cost = tree.cost.at[slot].set(cost_via[lane], mode="drop")
 
-    through = jnp.where(near, cost[new][:, None] + apart, jnp.inf)
+    # Rewire: the old node that gains most from each new one. The main root keeps its place.
+    cost_through_new = jnp.where(near, cost[new][:, None] + distances, jnp.inf)
     is_main_root = jnp.arange(tree.capacity) == 0
-    gain = jnp.where(is_main_root, -jnp.inf, cost - through)
+    gain = jnp.where(is_main_root, -jnp.inf, cost - cost_through_new)
     child, most = jnp.argmax(gain, axis=1), jnp.max(gain, axis=1)
+
+    # Two new nodes may want the same child: the one that offers more gets it, or the first.
     same_child = child[:, None] == child
     rival = (most[None] > most[:, None]) | (
         (most[None] == most[:, None]) & (jnp.arange(len(new)) < jnp.arange(len(new))[:, None])
@@ -73,6 +79,7 @@ def rewire(
         new[lane].astype(jnp.int32), mode="drop"
     )
 
+    # An adopted node passes its gain on to its whole subtree.
     tree = dataclasses.replace(tree, parent=parent, cost=cost)
     return jax.lax.cond(jnp.any(adopts), lambda t: with_costs(world, t), lambda t: t, tree)
 
@@ -88,6 +95,7 @@ def with_costs(world: Space, tree: Tree[Payload]) -> Tree[Payload]:
     has_parent = tree.parent >= 0
     ancestor = jnp.where(has_parent, tree.parent, jnp.arange(tree.capacity))
     length = jnp.where(has_parent, distance(world, tree.q[ancestor], tree.q), 0.0)
+    # After k rounds every node knows its ancestor 2^k generations up, and the length to there.
     for _ in range(max(tree.capacity - 1, 1).bit_length()):
         length, ancestor = length + length[ancestor], ancestor[ancestor]
     return dataclasses.replace(tree, cost=tree.cost[ancestor] + length)

@@ -1,12 +1,9 @@
-"""The loop around the kernel: jitted chunks on the device; clock, progress, Ctrl-C on the host."""
+"""The loop around the kernel: jitted chunks on the device; clock and progress on the host."""
 
-import contextlib
 import dataclasses
 import enum
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -16,6 +13,7 @@ import numpy as np
 
 from vrrt_jax.core.edges import Space
 from vrrt_jax.core.expand import expand
+from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.types import ExpansionPolicy, Tree, pytree
 
 CHUNK = 8  # iterations between two looks at the clock
@@ -34,10 +32,11 @@ class StopReason(enum.IntEnum):
 
 @pytree
 class Termination:
-    """When to stop, as traced numbers."""
+    """When a search ends, as traced numbers."""
 
     score: jax.Array  # () goal score
-    settle: jax.Array  # () i32 once there, go on until the best score has not improved for so long
+    # () i32 once there, go on until the best score has not improved for so long
+    settle_iterations: jax.Array
     max_iterations: jax.Array  # () i32
     patience: jax.Array  # () i32 give up after so many iterations without improvement
     min_improvement: jax.Array  # () what counts as one: so much less ...
@@ -69,7 +68,7 @@ def make_termination(
     score: float,
     *,
     max_iterations: int,
-    settle: int = 0,
+    settle_iterations: int = 0,
     patience: int | None = None,
     min_improvement: float = 0.0,
     min_ratio: float = 1.0,
@@ -77,7 +76,7 @@ def make_termination(
     """A stopping rule; without ``patience`` the search never counts as converged."""
     return Termination(
         score=jnp.float32(score),
-        settle=jnp.int32(settle),
+        settle_iterations=jnp.int32(settle_iterations),
         max_iterations=jnp.int32(max_iterations),
         patience=jnp.int32(patience if patience is not None else np.iinfo(np.int32).max),
         min_improvement=jnp.float32(min_improvement),
@@ -92,14 +91,15 @@ def initial_state(tree: Tree) -> SearchState:
     )
 
 
-def stop_reason(state: SearchState, stop: Termination) -> jax.Array:
+def stop_reason(state: SearchState, termination: Termination) -> jax.Array:
     """The :class:`StopReason` code () that holds, -1 while the search should go on."""
     tree = state.tree
     idle = tree.iteration - state.reference_iteration
+    reached = (jnp.min(tree.score) <= termination.score) & (idle >= termination.settle_iterations)
     reasons = (
-        (StopReason.REACHED, (jnp.min(tree.score) <= stop.score) & (idle >= stop.settle)),
-        (StopReason.CONVERGED, idle >= stop.patience),
-        (StopReason.ITERATIONS, tree.iteration >= stop.max_iterations),
+        (StopReason.REACHED, reached),
+        (StopReason.CONVERGED, idle >= termination.patience),
+        (StopReason.ITERATIONS, tree.iteration >= termination.max_iterations),
         (StopReason.TREE_FULL, tree.size >= tree.capacity),
     )
     code = jnp.int32(-1)
@@ -110,9 +110,10 @@ def stop_reason(state: SearchState, stop: Termination) -> jax.Array:
 
 def run_chunk(
     world: Space,
+    goal: Any,
     policy: ExpansionPolicy,
     state: SearchState,
-    stop: Termination,
+    termination: Termination,
     key: jax.Array,
     num_iterations: jax.Array,
 ) -> tuple[SearchState, jax.Array]:
@@ -120,13 +121,13 @@ def run_chunk(
     last = state.tree.iteration + num_iterations
 
     def goes_on(state: SearchState) -> jax.Array:
-        return (state.tree.iteration < last) & (stop_reason(state, stop) < 0)
+        return (state.tree.iteration < last) & (stop_reason(state, termination) < 0)
 
     def iterate(state: SearchState) -> SearchState:
-        tree = expand(world, policy, state.tree, key)
+        tree = expand(world, goal, policy, state.tree, key)
         best = jnp.min(tree.score)
-        bar = state.reference_score * stop.min_ratio - stop.min_improvement
-        improved = best < bar
+        needed = state.reference_score * termination.min_ratio - termination.min_improvement
+        improved = best < needed
         return SearchState(
             tree=tree,
             reference_score=jnp.where(improved, best, state.reference_score),
@@ -134,20 +135,21 @@ def run_chunk(
         )
 
     state = jax.lax.while_loop(goes_on, iterate, state)
-    return state, stop_reason(state, stop)
+    return state, stop_reason(state, termination)
 
 
 _chunk = jax.jit(run_chunk)
-_chunks = jax.jit(jax.vmap(run_chunk, in_axes=(None, 0, 0, 0, 0, None)))
+_chunks = jax.jit(jax.vmap(run_chunk, in_axes=(None, 0, None, 0, 0, 0, None)))
 
 
 def search(
     world: Space,
+    goal: Any,
     policy: ExpansionPolicy,
     tree: Tree,
     *,
     key: jax.Array,
-    stop: Termination,
+    termination: Termination,
     time_limit_s: float = float("inf"),
     batched: bool = False,
     on_progress: Callable[[SearchState, float], Any] | None = None,
@@ -156,25 +158,27 @@ def search(
 
     Args:
         world: robot and obstacles.
+        goal: where to.
         policy: the planner.
         tree: the tree to start from.
-        key: random key; the same key gives the same tree on the same machine, unless time stops it.
-        stop: stopping rules.
+        key: random key; the same key gives the same tree on the same machine, unless time ends it.
+        termination: when to end.
         time_limit_s: wall time without compilation [s], looked at every few iterations.
-        batched: policy, tree, key and stop lead with an axis of Q problems; ends when all have.
+        batched: goal, tree, key and termination lead with an axis of Q problems; the search ends
+            when all have.
         on_progress: called with the state and the seconds so far after every chunk.
     """
     state = (jax.vmap(initial_state) if batched else initial_state)(tree)
-    advance = partial(_chunks if batched else _chunk, world, policy)
+    advance = partial(_chunks if batched else _chunk, world, goal, policy)
     started = time.perf_counter()
-    jax.block_until_ready(advance(state, stop, key, jnp.int32(0)))
+    jax.block_until_ready(advance(state, termination, key, jnp.int32(0)))
     compile_s = time.perf_counter() - started
 
     history = [_record(state, 0.0)]
     started = time.perf_counter()
     with interruptible() as interrupted:
         while True:
-            state, codes = jax.block_until_ready(advance(state, stop, key, jnp.int32(CHUNK)))
+            state, codes = jax.block_until_ready(advance(state, termination, key, jnp.int32(CHUNK)))
             seconds = time.perf_counter() - started
             history.append(_record(state, seconds))
             if on_progress is not None:
@@ -202,43 +206,3 @@ def _record(state: SearchState, seconds: float) -> tuple[float, float, float, fl
     tree = jax.device_get(state.tree)
     best = tree.score.min(axis=-1).max()
     return float(np.max(tree.iteration)), seconds, float(best), float(np.max(tree.size))
-
-
-@contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Raise KeyboardInterrupt at the end after a Ctrl-C, for what is no result if it ends early."""
-    with interruptible() as interrupted:
-        yield
-    if interrupted.is_set():
-        raise KeyboardInterrupt
-
-
-_interrupted: list[threading.Event] = []  # of the outermost block that runs
-
-
-@contextlib.contextmanager
-def interruptible() -> Iterator[threading.Event]:
-    """Turn Ctrl-C into a flag, so that the best path so far survives it; a second one is fatal.
-
-    Blocks inside each other share the flag.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield threading.Event()
-        return
-    if _interrupted:
-        yield _interrupted[0]
-        return
-    event = threading.Event()
-
-    def on_interrupt(signum, frame):
-        if event.is_set():
-            raise KeyboardInterrupt
-        event.set()
-
-    previous = signal.signal(signal.SIGINT, on_interrupt)
-    _interrupted.append(event)
-    try:
-        yield event
-    finally:
-        _interrupted.clear()
-        signal.signal(signal.SIGINT, previous)

@@ -27,6 +27,25 @@ def best_ms(function: Callable, *args: Any, repeats: int = 30) -> tuple[float, f
     return 1e3 * min(times), first_s
 
 
+def timed(run: Callable[[], Any], *programs: Any) -> tuple[Any, float, float]:
+    """The result of a run, and the seconds that compiling these jitted functions took, and it."""
+
+    def clocked() -> tuple[Any, float]:
+        started = time.perf_counter()
+        result = jax.block_until_ready(run())
+        return result, time.perf_counter() - started
+
+    def compiled() -> int:
+        return sum(program._cache_size() for program in programs)
+
+    before = compiled()
+    result, first_s = clocked()
+    if compiled() == before:
+        return result, 0.0, first_s
+    result, run_s = clocked()
+    return result, first_s - run_s, run_s
+
+
 def interleaved_ms(functions: dict[str, Callable[[], Any]], repeats: int = 30) -> dict[str, float]:
     """Smallest times [ms] of several calls taken in turn, so that noise hits all alike."""
     for call in functions.values():

@@ -50,6 +50,11 @@ def create(
     )
 
 
+def root_costs(num: int) -> jax.Array:
+    """Costs (num,) of roots: 0 for the start, :data:`UNREACHED` for the others."""
+    return jnp.full(num, UNREACHED).at[0].set(0.0)
+
+
 def insert(
     tree: Tree[Payload],
     *,
@@ -58,9 +63,9 @@ def insert(
     cost: jax.Array,
     score: jax.Array,
     payload: Payload,
-    ok: jax.Array,
+    valid: jax.Array,
 ) -> tuple[Tree[Payload], jax.Array]:
-    """Append the children that are ok, in lane order, as far as there is room.
+    """Append the valid children, in lane order, as far as there is room.
 
     Args:
         tree: the tree.
@@ -69,13 +74,14 @@ def insert(
         cost: (B,) their path lengths from the root.
         score: (B,) their scores.
         payload: leaves (B, ...).
-        ok: (B,) which to insert.
+        valid: (B,) which to insert.
 
     Returns:
         The new tree, and the slot (B,) of each child; N where it was not inserted.
     """
-    wanted = tree.size + jnp.cumsum(ok) - 1
-    slot = jnp.where(ok & (wanted < tree.capacity), wanted, tree.capacity).astype(jnp.int32)
+    # Every valid child gets the next empty slot. Slot N is out of range: writes to it are dropped.
+    wanted = tree.size + jnp.cumsum(valid) - 1
+    slot = jnp.where(valid & (wanted < tree.capacity), wanted, tree.capacity).astype(jnp.int32)
 
     def put(column: jax.Array, rows: jax.Array) -> jax.Array:
         return column.at[slot].set(rows.astype(column.dtype), mode="drop")
@@ -86,7 +92,7 @@ def insert(
         parent=put(tree.parent, parent),
         cost=put(tree.cost, cost),
         score=put(tree.score, score),
-        size=jnp.minimum(tree.size + jnp.sum(ok), tree.capacity).astype(jnp.int32),
+        size=jnp.minimum(tree.size + jnp.sum(valid), tree.capacity).astype(jnp.int32),
         payload=jax.tree.map(put, tree.payload, payload),
     )
     return grown, slot
@@ -104,6 +110,12 @@ def distances(world: Space, tree: Tree, q: jax.Array, among: jax.Array | bool = 
     world with a costly metric rules out from afar.
     """
     return world.distances(tree.q, q, occupied(tree) & among)
+
+
+def branch_path(tree: Tree, index: int | None = None) -> np.ndarray:
+    """The path (P, D) from the root of a node to it; the node with the best score by default."""
+    index = int(np.argmin(tree.score)) if index is None else index
+    return np.asarray(tree.q)[lineage(tree, index)]
 
 
 def lineage(tree: Tree, index: int) -> np.ndarray:

@@ -1,7 +1,6 @@
 """The data that flows through the kernel.
 
-Letters: ``B`` lanes (32), ``N`` node capacity, ``D`` joints, ``L`` links, ``K`` obstacle slots.
-Joints in [rad] or [m], lengths in [m], quaternions wxyz.
+Letters: ``B`` lanes (32), ``N`` node capacity, ``D`` joints. Joints in [rad] or [m].
 """
 
 import dataclasses
@@ -9,6 +8,7 @@ import enum
 from typing import Any, Generic, Protocol, TypeVar, dataclass_transform
 
 import jax
+import numpy as np
 
 Payload = TypeVar("Payload")
 _MARK = "_is_pytree"  # attribute of the classes that :func:`pytree` has made
@@ -113,46 +113,78 @@ class Expansion:
     blocked: jax.Array  # (B,) bool, something lies on the edge
 
 
+class Goal(Protocol):
+    """Where a path should end: a pytree of traced arrays, so that a new goal never re-compiles.
+
+    :class:`~vrrt_jax.core.goal.ConfigurationGoal` is one; a class with these two members is
+    another.
+    """
+
+    @property
+    def threshold(self) -> jax.Array:
+        """() the goal is reached by configurations whose loss is at most this."""
+        ...
+
+    def loss(self, world: Any, q: jax.Array) -> jax.Array:
+        """How far a configuration (D,) is from the goal, ()."""
+        ...
+
+
 class ExpansionPolicy(Protocol[Payload]):
-    """A planner: a pytree whose arrays are traced, so that a new goal never re-compiles."""
+    """A planner: a pytree whose arrays are traced, so that a new setting never re-compiles.
+
+    The kernel calls ``propose``, ``evaluate`` and ``after_insert`` in every iteration, traced; the
+    other methods run on the host, before and after the search.
+    """
 
     @property
     def edge_steps(self) -> int:
         """S, the number of collision checks along an edge (static)."""
         ...
 
-    def propose(self, world: Any, tree: Tree[Payload], key: jax.Array) -> Proposals:
+    @property
+    def lanes(self) -> int:
+        """B, the number of expansions in an iteration (static)."""
+        ...
+
+    def init(self, world: Any, goal: Any, q_roots: np.ndarray, capacity: int) -> Tree[Payload]:
+        """The tree before the first iteration.
+
+        Args:
+            world: robot and obstacles.
+            goal: where to.
+            q_roots: (R, D) the start, and other configurations that are worth starting from. No
+                path to these others is known yet: their cost is
+                :data:`~vrrt_jax.core.tree.UNREACHED`.
+            capacity: N.
+        """
+        ...
+
+    def goal_score(self, goal: Any) -> float:
+        """The search ends once a node's score is this or lower; ``-inf`` to go on improving."""
+        ...
+
+    def propose(self, world: Any, goal: Any, tree: Tree[Payload], key: jax.Array) -> Proposals:
         """Choose a parent and a target for each of the B lanes."""
         ...
 
-    def evaluate(self, world: Any, q: jax.Array, proposals: Proposals) -> tuple[jax.Array, Payload]:
+    def evaluate(
+        self, world: Any, goal: Any, q: jax.Array, proposals: Proposals
+    ) -> tuple[jax.Array, Payload]:
         """Scores (B,) and payloads (B, ...) of the children ``q`` (B, D)."""
         ...
 
     def after_insert(
-        self, world: Any, tree: Tree[Payload], proposals: Proposals, expansion: Expansion
+        self,
+        world: Any,
+        goal: Any,
+        tree: Tree[Payload],
+        proposals: Proposals,
+        expansion: Expansion,
     ) -> Tree[Payload]:
         """Book-keeping once the children are in: frontier flags, rewiring."""
         ...
 
-
-class Status(enum.Enum):
-    """How a plan ended, with what to try next."""
-
-    SOLVED = "a collision-free path whose end matches the goal, checked with C MuJoCo"
-    NO_MATCH = (
-        "no configuration renders like the goal: check the camera and the self-model, "
-        "add a view, or raise max_iterations"
-    )
-    NO_PATH = (
-        "matched, but no way there was found: raise connect_iterations and capacity, or move the "
-        "obstacles"
-    )
-    MAX_ITERATIONS = "the iterations ran out: raise max_iterations"
-    TREE_FULL = "the tree is full: raise capacity"
-    TIME_LIMIT = "the time limit passed: raise time_limit_s"
-    INTERRUPTED = "interrupted: the best path so far is returned"
-    NOT_VERIFIED = (
-        "the path touches something under the exact check: lower the resolution or "
-        "raise the collision margin"
-    )
+    def extract_path(self, tree: Tree[Payload]) -> np.ndarray | None:
+        """The path (P, D) from the start to the node with the best score, None if there is none."""
+        ...

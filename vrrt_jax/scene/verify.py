@@ -4,28 +4,20 @@ Nothing here shares code with MJX or with the distances that the planner compute
 there cannot hide itself.
 """
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
+from vrrt_jax.core.edges import unwrapped
+from vrrt_jax.core.postprocess import CheckedPath
+from vrrt_jax.core.result import Verification
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.obstacles import Obstacle
+from vrrt_jax.scene.world import World, obstacle_list
 
 _LIMIT_TOLERANCE = 1e-5  # [rad] or [m], paths come in float32
 _HALF_TURN_TOLERANCE = 1e-4  # [rad]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Verification:
-    """What :func:`verify_path` found."""
-
-    ok: bool  # inside the limits and free all the way
-    clearance: float  # smallest distance between robot and obstacles [m], nan without obstacles
-    geometry: str  # "meshes" or "spheres": what the robot was made of
-    checked: int  # number of configurations checked
-    contact: str | None  # the first violation, such as "link5 touches box_2 at 37 % of the path"
 
 
 def verify_path(
@@ -58,7 +50,7 @@ def verify_path(
     if not step > 0:
         raise ValueError(f"step is {step}; expected a positive number [rad], such as 0.005")
     exact = exact_scene(robot, obstacles, geometry=geometry)
-    configurations, fractions = _interpolate(robot, path, step)
+    configurations, fractions = interpolate(robot, path, step)
     # Contacts are asked for up to the first configuration outside the limits.
     outside = _outside_limits(robot, configurations)
     first_outside = int(outside.any(1).argmax()) if outside.any() else len(configurations)
@@ -83,6 +75,23 @@ def verify_path(
         geometry=exact.geometry,
         checked=checked,
         contact=contact,
+    )
+
+
+def check_path(robot: Robot, world: World, path: np.ndarray, *, step: float) -> CheckedPath:
+    """The exact check of a path among a world's obstacles; see :func:`verify_path`.
+
+    Args:
+        robot: from :func:`vrrt_jax.robots.load_robot`.
+        world: the obstacles.
+        path: (P, D) waypoints; joints that wrap go on, so that waypoints can be interpolated.
+        step: largest distance between checked configurations [rad].
+    """
+    path = unwrapped(world, path)
+    return CheckedPath(
+        path=path,
+        trajectory=interpolate(robot, path, step)[0].astype(np.float32),
+        verification=verify_path(robot, obstacle_list(world), path, step=step),
     )
 
 
@@ -121,7 +130,7 @@ def _checked_path(robot: Robot, path: np.ndarray) -> np.ndarray:
     return path
 
 
-def _interpolate(robot: Robot, path: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+def interpolate(robot: Robot, path: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Configurations (n, D) along the path, ends included, and their share (n,) of its length."""
     turns = np.diff(path, axis=0)
     # Turns by more than pi take the shorter direction. A turn by pi, up to rounding, does not.

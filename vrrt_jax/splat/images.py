@@ -35,16 +35,16 @@ def read_image(path: str | Path) -> np.ndarray:
     return pixels.astype(np.float32) / 255.0
 
 
-def write_image(path: str | Path, rgb: np.ndarray, coverage: np.ndarray) -> None:
-    """Write a goal image with its coverage as transparency: a PNG (H, W, 4).
+def write_image(path: str | Path, rgb: np.ndarray, alpha: np.ndarray) -> None:
+    """Write a goal image with its alpha as transparency: a PNG (H, W, 4).
 
     Args:
         path: where to.
         rgb: (H, W, 3) the robot over black, in [0, 1].
-        coverage: (H, W).
+        alpha: (H, W).
     """
-    straight = rgb / np.maximum(coverage, 1e-3)[..., None]
-    pixels = np.concatenate([np.clip(straight, 0, 1), coverage[..., None]], axis=-1)
+    straight = rgb / np.maximum(alpha, 1e-3)[..., None]
+    pixels = np.concatenate([np.clip(straight, 0, 1), alpha[..., None]], axis=-1)
     Image.fromarray(np.round(255 * pixels).astype(np.uint8), "RGBA").save(path)
 
 
@@ -58,7 +58,7 @@ def prepare_goal(
 
     Args:
         images: V arrays (H, W, 3) or (H, W, 4), uint8 or float in [0, 1]. The fourth channel is the
-            robot's coverage; without it, or where all of it is opaque, whatever differs from the
+            robot's alpha; without it, or where all of it is opaque, whatever differs from the
             color that prevails on the border is taken to be robot.
         cameras: V cameras of the images' sizes.
         image_px: wanted height; the images are reduced by the nearest whole factor.
@@ -83,15 +83,15 @@ def prepare_goal(
         )
     views = []
     for image, camera, mask in zip(images, cameras, masks, strict=True):
-        rgb, coverage = _checked(np.asarray(image), camera)
-        valid = np.ones_like(coverage) if mask is None else _checked_mask(mask, camera)
+        rgb, alpha = _checked(np.asarray(image), camera)
+        valid = np.ones_like(alpha) if mask is None else _checked_mask(mask, camera)
         factor = max(1, round(camera.height / image_px))
         share = _blocks(valid, factor)
         known = np.maximum(share, 1e-6)
         views.append(
             (
                 _blocks(rgb * valid[..., None], factor) / known[..., None],
-                _blocks(coverage * valid, factor) / known,
+                _blocks(alpha * valid, factor) / known,
                 np.where(share >= KNOWN, share, 0.0).astype(np.float32),
                 shrunk(camera, factor),
             )
@@ -101,8 +101,8 @@ def prepare_goal(
         raise ValueError(
             f"the views have sizes {sorted(s[:2] for s in shapes)}; make them all one size"
         )
-    rgb, coverage, valid = (jnp.asarray(np.stack([v[i] for v in views])) for i in range(3))
-    goal = GoalImage(rgb=rgb, coverage=coverage, valid=valid)
+    rgb, alpha, valid = (jnp.asarray(np.stack([v[i] for v in views])) for i in range(3))
+    goal = GoalImage(rgb=rgb, alpha=alpha, valid=valid)
     return goal, stack_cameras([view[3] for view in views])
 
 
@@ -129,7 +129,7 @@ def cut_goal(
 
 
 def _checked(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """The robot over black (H, W, 3), and its coverage (H, W)."""
+    """The robot over black (H, W, 3), and its alpha (H, W)."""
     if image.ndim != 3 or image.shape[2] not in (3, 4):
         raise ValueError(
             f"the goal image has shape {image.shape}; expected (height, width, 3) for RGB or "
@@ -154,8 +154,8 @@ def _checked(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]
             "floats in [0, 1] or uint8"
         )
     if image.shape[2] == 4 and image[..., 3].min() < OPAQUE:
-        coverage = image[..., 3]
-        if coverage.mean() < 1e-4:
+        alpha = image[..., 3]
+        if alpha.mean() < 1e-4:
             raise ValueError(
                 "the goal image's mask (its fourth channel) is empty: no robot to match; check "
                 "that the mask is 1 on the robot"
@@ -163,18 +163,18 @@ def _checked(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]
     else:
         border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
         apart = np.abs(image - np.median(border, axis=0))[..., :3].max(axis=-1)
-        coverage = (apart > BACKGROUND_TOLERANCE).astype(np.float32)
-        if coverage.mean() < 1e-4:
+        alpha = (apart > BACKGROUND_TOLERANCE).astype(np.float32)
+        if alpha.mean() < 1e-4:
             raise ValueError(
                 "the goal image is blank: every pixel has the color of the border; give an "
                 "image that shows the robot"
             )
-        if coverage.mean() > MOST:
+        if alpha.mean() > MOST:
             raise ValueError(
-                f"{100 * coverage.mean():.0f} % of the goal image differ from the color of its "
+                f"{100 * alpha.mean():.0f} % of the goal image differ from the color of its "
                 "border; expected a plain background, or the robot's mask as fourth channel"
             )
-    return image[..., :3] * coverage[..., None], coverage
+    return image[..., :3] * alpha[..., None], alpha
 
 
 def _checked_mask(mask: np.ndarray, camera: Camera) -> np.ndarray:

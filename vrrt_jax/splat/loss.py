@@ -4,19 +4,20 @@ import jax
 import jax.numpy as jnp
 
 from vrrt_jax.robots.kinematics import Chain, link_poses
-from vrrt_jax.splat.raster import Windows, render
+from vrrt_jax.splat.raster import render
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
+from vrrt_jax.splat.windows import Windows
 
 
 def image_loss(
     rgb: jax.Array,
-    coverage: jax.Array,
+    alpha: jax.Array,
     goal_rgb: jax.Array,
-    goal_coverage: jax.Array,
+    goal_alpha: jax.Array,
     valid: jax.Array,
 ) -> jax.Array:
     """Mean squared error () over the valid pixels and the four channels of one view."""
-    error = jnp.sum((rgb - goal_rgb) ** 2, axis=-1) + (coverage - goal_coverage) ** 2
+    error = jnp.sum((rgb - goal_rgb) ** 2, axis=-1) + (alpha - goal_alpha) ** 2
     return jnp.sum(valid * error) / (4.0 * jnp.maximum(jnp.sum(valid), 1.0))
 
 
@@ -31,8 +32,8 @@ def goal_loss(
     """Loss () of a configuration (D,): the mean over the V views."""
     views = _views(chain, splats, cameras, q, windows)
     losses = [
-        image_loss(rgb, coverage, goal.rgb[view], goal.coverage[view], goal.valid[view])
-        for view, (rgb, coverage) in enumerate(views)
+        image_loss(rgb, alpha, goal.rgb[view], goal.alpha[view], goal.valid[view])
+        for view, (rgb, alpha) in enumerate(views)
     ]
     return jnp.mean(jnp.stack(losses))
 
@@ -40,7 +41,7 @@ def goal_loss(
 def _views(
     chain: Chain, splats: SplatModel, cameras: Camera, q: jax.Array, windows: Windows | None
 ) -> list[tuple[jax.Array, jax.Array]]:
-    """Color and coverage in each of the V views."""
+    """Color and alpha in each of the V views."""
     poses = link_poses(chain, q)
     each = [jax.tree.map(lambda leaf: leaf[v], cameras) for v in range(len(cameras.focal))]  # noqa: B023
     return [render(splats, poses, camera, windows) for camera in each]
@@ -59,15 +60,15 @@ def weighted_image(
     Its squared distance from :func:`weighted_goal` is the :func:`goal_loss`.
     """
     views = [
-        jnp.concatenate([rgb, coverage[..., None]], axis=-1)
-        for rgb, coverage in _views(chain, splats, cameras, q, windows)
+        jnp.concatenate([rgb, alpha[..., None]], axis=-1)
+        for rgb, alpha in _views(chain, splats, cameras, q, windows)
     ]
     return (jnp.stack(views) * _root_weight(goal)).ravel()
 
 
 def weighted_goal(goal: GoalImage) -> jax.Array:
     """The goal as a vector (V * H * W * 4,), see :func:`weighted_image`."""
-    image = jnp.concatenate([goal.rgb, goal.coverage[..., None]], axis=-1)
+    image = jnp.concatenate([goal.rgb, goal.alpha[..., None]], axis=-1)
     return (image * _root_weight(goal)).ravel()
 
 

@@ -33,7 +33,7 @@ class Level:
 
     splats: SplatModel
     size_px: int  # image height that it was trained at [px]
-    psnr_db: float  # on unseen poses and cameras, over RGB and coverage
+    psnr_db: float  # on unseen poses and cameras, over RGB and alpha
     match_threshold: float  # loss over covered share, under which 95 % of true poses lie
 
 

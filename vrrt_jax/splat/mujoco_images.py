@@ -23,7 +23,7 @@ class Picture:
     """One rendered view."""
 
     rgb: np.ndarray  # (H, W, 3) float32, the robot over black
-    coverage: np.ndarray  # (H, W) float32
+    alpha: np.ndarray  # (H, W) float32
     valid: np.ndarray  # (H, W) bool, False where an obstacle may hide the robot
 
 
@@ -73,7 +73,7 @@ class MeshRenderer:
         self._renderer((8, 8))
 
     def picture(self, q: np.ndarray, camera: Camera) -> Picture:
-        """The robot alone over black, with its exact coverage; obstacles only hide it."""
+        """The robot alone over black, with its exact alpha; obstacles only hide it."""
         scale = max(1, min(SUPERSAMPLING, MAX_RENDER_PX // max(camera.height, camera.width)))
         with self._drawing_obstacles():
             renderer = self._aim(q, camera, scale)
@@ -86,7 +86,7 @@ class MeshRenderer:
         mask = is_geom & (group != OBSTACLE_GROUP)
         return Picture(
             rgb=_block_mean(rgb * mask[..., None], scale),
-            coverage=_block_mean(mask.astype(np.float32), scale),
+            alpha=_block_mean(mask.astype(np.float32), scale),
             valid=_block_mean((group != OBSTACLE_GROUP).astype(np.float32), scale) > 0.999,
         )
 

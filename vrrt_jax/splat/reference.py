@@ -1,27 +1,15 @@
 """The plain compositor of 3D Gaussian splatting: sorted, dense over pixels, in a few lines.
 
-It is the oracle for the fast rasterizer, and the choice where fidelity counts more than time: it
-knows anisotropic splats and true occlusion. It holds as many images as there are splats.
+Occlusion is true here, not soft. The memory is that of as many images as there are splats. The fast
+rasterizer is tested and timed against this one.
 """
 
 import jax
 import jax.numpy as jnp
 
-from vrrt_jax.core.types import pytree
 from vrrt_jax.splat.camera import project
-from vrrt_jax.splat.raster import NEAR, PIXEL_BLUR
+from vrrt_jax.splat.projection import NEAR, PIXEL_BLUR
 from vrrt_jax.splat.types import Camera, SplatModel
-
-
-@pytree
-class Gaussians:
-    """Anisotropic splats in the world."""
-
-    mean: jax.Array  # (G, 3) [m]
-    quaternion: jax.Array  # (G, 4) wxyz, principal axes to world; need not have length 1
-    scale: jax.Array  # (G, 3) standard deviations along the principal axes [m]
-    density: jax.Array  # (G,) optical depth at the center
-    rgb: jax.Array  # (G, 3) color towards the camera
 
 
 def composite(
@@ -43,7 +31,7 @@ def composite(
         size: (H, W), static.
 
     Returns:
-        rgb (H, W, 3) over black, and coverage (H, W).
+        rgb (H, W, 3) over black, and alpha (H, W).
     """
     order = jnp.argsort(depth)
     y, x = (jnp.arange(n, dtype=pixel.dtype) + 0.5 for n in size)
@@ -61,53 +49,6 @@ def composite(
     return jnp.einsum("ghw,gc->hwc", arriving * alpha, rgb[order]), 1.0 - passed[-1]
 
 
-def render_gaussians(gaussians: Gaussians, camera: Camera) -> tuple[jax.Array, jax.Array]:
-    """Render anisotropic splats.
-
-    Args:
-        gaussians: in any order.
-        camera: the view; its size is the image's.
-
-    Returns:
-        rgb (H, W, 3) over black, and coverage (H, W).
-    """
-    pixel, depth = project(camera, gaussians.mean)
-    visible = depth > NEAR
-    footprint = _projected_covariance(gaussians, camera, jnp.where(visible, depth, 1.0))
-    density = jnp.where(visible, gaussians.density, 0.0)
-    size = (camera.height, camera.width)
-    return composite(pixel, footprint, depth, density, gaussians.rgb, size)
-
-
-def _projected_covariance(gaussians: Gaussians, camera: Camera, depth: jax.Array) -> jax.Array:
-    """Covariances (G, 2, 2) after the projection's affine approximation at each mean (EWA)."""
-    rotation, translation = camera.world_to_cam[:3, :3], camera.world_to_cam[:3, 3]
-    slope = (gaussians.mean @ rotation.T + translation)[:, :2] / depth[:, None]
-    # Far outside the image the approximation explodes.
-    size = jnp.array([camera.width, camera.height], slope.dtype)
-    limit = 1.3 * jnp.maximum(camera.principal_point, size - camera.principal_point) / camera.focal
-    slope = jnp.clip(slope, -limit, limit)
-    jacobian = jnp.concatenate(
-        [jnp.broadcast_to(jnp.eye(2), (len(slope), 2, 2)), -slope[:, :, None]], axis=2
-    )
-    axes = _rotations(gaussians.quaternion) * gaussians.scale[:, None]
-    spread = jnp.einsum("gij,jk,gkl->gil", jacobian, rotation, axes)
-    spread = spread * (camera.focal / depth)[:, None, None]
-    return spread @ jnp.swapaxes(spread, 1, 2) + PIXEL_BLUR**2 * jnp.eye(2)
-
-
-def _rotations(quaternion: jax.Array) -> jax.Array:
-    """Matrices (G, 3, 3)."""
-    squared = jnp.sum(quaternion**2, axis=1, keepdims=True)
-    w, x, y, z = (quaternion * jax.lax.rsqrt(squared)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return jnp.moveaxis(jnp.array(rows), -1, 0)
-
-
 def render_reference(
     model: SplatModel, poses: jax.Array, camera: Camera
 ) -> tuple[jax.Array, jax.Array]:
@@ -119,7 +60,7 @@ def render_reference(
         camera: the view; its size is the image's.
 
     Returns:
-        rgb (H, W, 3), the robot over black, and coverage (H, W).
+        rgb (H, W, 3), the robot over black, and alpha (H, W).
     """
     rotation, translation = poses[model.link, :3, :3], poses[model.link, :3, 3]
     mean = jnp.einsum("gij,gj->gi", rotation, model.mean) + translation

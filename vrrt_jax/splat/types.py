@@ -27,7 +27,7 @@ class SplatModel:
 
     mean: jax.Array  # (G, 3) center in the link's frame [m]
     radius: jax.Array  # (G,) standard deviation [m]
-    density: jax.Array  # (G,) optical depth at the center; coverage = 1 - exp(-sum)
+    density: jax.Array  # (G,) optical depth at the center; alpha = 1 - exp(-sum)
     rgb: jax.Array  # (G, 3) color seen from nowhere in particular
     view_color_gradient: (
         jax.Array
@@ -59,5 +59,5 @@ class GoalImage:
     """What the robot should look like, in V views of one size."""
 
     rgb: jax.Array  # (V, H, W, 3) the robot over black
-    coverage: jax.Array  # (V, H, W) share of the pixel that the robot covers
+    alpha: jax.Array  # (V, H, W) share of the pixel that the robot covers
     valid: jax.Array  # (V, H, W) weight of the pixel in the loss, 0 where unknown

@@ -1,51 +1,82 @@
-"""From a grown tree to a verified path."""
+"""From a grown tree to a result: choose where to end, find a path there, shorten and verify it."""
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.config import PlannerConfig, PlanResult
+from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import unwrapped
-from vrrt_jax.core.planners.rrt import tree_path
-from vrrt_jax.core.planners.rrt_connect import RRTConnect, connection_path
-from vrrt_jax.core.search import SearchResult, StopReason, make_termination, search
-from vrrt_jax.core.shortcut import path_length, shortcut
-from vrrt_jax.core.types import Rejection, Status
+from vrrt_jax.core.edges import free_prefix
+from vrrt_jax.core.goal import ConfigurationGoal
+from vrrt_jax.core.planners import RRTConnect
+from vrrt_jax.core.postprocess import plan_result, postprocess, unchecked
+from vrrt_jax.core.result import (
+    EARLY_STOPS,
+    STATUS_OF,
+    PlanResult,
+    Status,
+    with_time_of,
+)
+from vrrt_jax.core.search import SearchResult, make_termination, search
+from vrrt_jax.core.timing import timed
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.exact import exact_scene
-from vrrt_jax.scene.verify import verify_path
-from vrrt_jax.scene.world import World, obstacle_list, with_margin
-from vrrt_jax.visual.polish import DISTINCT, Polishing, apart, glance, look_at, polish
+from vrrt_jax.scene.verify import check_path, verify_path
+from vrrt_jax.scene.world import World, obstacle_list, overrides_is_free, with_margin
+from vrrt_jax.visual.distinct import distances_to, distinct
+from vrrt_jax.visual.polish import Polished, evaluate_cost, linearize, polish
+from vrrt_jax.visual.problem import VisualProblem
 
-STATUS_OF = {
-    StopReason.CONVERGED: Status.NO_MATCH,
-    StopReason.ITERATIONS: Status.MAX_ITERATIONS,
-    StopReason.TREE_FULL: Status.TREE_FULL,
-    StopReason.TIME_LIMIT: Status.TIME_LIMIT,
-    StopReason.INTERRUPTED: Status.INTERRUPTED,
-}
-HURRIED = (StopReason.TIME_LIMIT, StopReason.INTERRUPTED)  # what ends these, ends all
-TRIED = 3  # matched configurations that are tried before there is no path
-REFUSED = 3  # paths that the exact check may refuse before it has the last word
-WARY = 0.01  # [m] by which each of them keeps farther away than the one before
-GLANCE = 0.02  # [rad] between configurations of a straight line that is tried
-GRAZE = 0.002  # [m] that it keeps away: what links move between configurations of the last check
+MAX_GOALS = 3  # matched configurations that are tried before there is no path
+MAX_REPLANS = 3  # paths that the exact check may refuse before it has the last word
+MARGIN_STEP = 0.01  # [m] by which each of them keeps farther away than the one before
+SWEEP_STEP = 0.02  # [rad] between configurations of a straight line that is tried
+SWEEP_MARGIN = 0.002  # [m] that it keeps away: what links move between two of the last check
 SAME_LOSS = 1.05  # losses within this factor are the same match
-ALIKE = 1.1  # and within this factor the image does not tell which it is
+AMBIGUITY_RATIO = 1.1  # and within this factor the image does not tell which it is
+ADVICE = {
+    Status.SOLVED: "",
+    Status.NO_MATCH: "check the camera and the self-model, add a view, or raise max_iterations",
+    Status.NO_PATH: "raise connect_iterations and tree.capacity, or move the obstacles",
+    Status.MAX_ITERATIONS: "raise max_iterations",
+    Status.TREE_FULL: "raise tree.capacity",
+    Status.TIME_LIMIT: "raise time_limit_s",
+    Status.INTERRUPTED: "run it again",
+    Status.NOT_VERIFIED: "lower the world's resolution or raise its margin",
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Ends:
+    """Where a path may end."""
+
+    q: np.ndarray  # (n, D)
+    loss: np.ndarray  # (n,)
+    cost: np.ndarray  # (n,) which tells apart those that look alike
+    order: list[int]  # which to try, the best first
+    rivals: list[int]  # which of them are worth naming beside the one that is taken
+    paths: dict[int, np.ndarray]  # (P, D) by end, where the tree has one
+    threshold: float  # loss of a match
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Chosen:
+    """The end that was taken, and the way there."""
+
+    path: np.ndarray | None  # (P, D), None if there is no way
+    target: np.ndarray  # (D,)
+    loss: float
+    threshold: float
 
 
 def finish_visual(
     robot: Robot,
     world: World,
+    problem: VisualProblem,
     found: SearchResult,
-    goal_loss: float,
-    polishing: Polishing | None,
     q_start: np.ndarray,
     key: jax.Array,
     config: PlannerConfig,
@@ -55,77 +86,128 @@ def finish_visual(
     Args:
         robot: whose path it is.
         world: robot and obstacles.
+        problem: the goal at every resolution.
         found: the search.
-        goal_loss: that counts as matched in it.
-        polishing: how to look at matches more closely.
         q_start: (D,).
         key: random key.
         config: settings.
     """
-    score, q = np.asarray(found.tree.score), np.asarray(found.tree.q)
-    search_goal_loss = goal_loss
-    hurried = found.stopped in HURRIED
-    if polishing is not None and not hurried:
-        goal_loss = polishing.goal_loss
-        nodes = list(_distinct(world, score, q, q_start, config.hypotheses, np.inf))
-        found, (q, score, cost) = _polished(found, world, polishing, q[nodes], key)
-        far = apart(world, q, q_start) ** 2  # of two that look alike, the nearer is likelier
-        order = np.lexsort([cost * (1.0 + config.start_preference * far), score > goal_loss])
-        rivals = [int(k) for k in order if np.isfinite(cost[k])] or [0]
-        ends = [k for k in rivals if score[k] <= goal_loss] or rivals
-        paths = {}
-    else:
-        if hurried and score.min() > goal_loss:  # nothing matches: the best that a path leads to
-            score = np.where(np.asarray(found.tree.cost) < trees.UNREACHED, score, np.inf)
-        ends = list(_distinct(world, score, q, q_start, TRIED, goal_loss))
-        paths = {end: tree_path(found.tree, end) for end in ends}
-        paths = {end: path for end, path in paths.items() if np.array_equal(path[0], q_start)}
-        rivals, cost = [], score  # on a small image even neighbors look the same
-    for end in ends[:TRIED]:
-        path = paths.get(end)
+    search_threshold = float(problem.goal.threshold)
+    found, ends = _choose_ends(world, problem, found, q_start, key, config)
+
+    # Try the ends in turn: by the tree's own path, straight, or by RRT-Connect.
+    path, end = None, ends.order[0]
+    for candidate in ends.order[:MAX_GOALS]:
+        path = ends.paths.get(candidate)
         if path is None:
-            found, path = _straight(robot, world, found, q_start, q[end])
+            found, path = _straight(robot, world, found, q_start, ends.q[candidate])
         if path is None:
-            found, path = _connected(world, found, q_start, q[end], key, config)
-        if path is not None or found.stopped in HURRIED:
+            found, path = _connect(world, found, q_start, ends.q[candidate], key, config)
+        if path is not None:
+            end = candidate
+        if path is not None or found.stopped in EARLY_STOPS:
             break
-    if path is None:
-        end = ends[0]
-    target, loss = q[end], float(score[end])
-    matching = [k for k in rivals if score[k] <= goal_loss]
-    alike = [k for k in matching if k != end and cost[k] <= ALIKE * cost[end]]
-    result = finish(robot, world, found, path, target, loss, goal_loss, key, config, q_start)
-    for again in range(1, REFUSED):
+    target, loss = ends.q[end], float(ends.loss[end])
+    chosen = Chosen(path=path, target=target, loss=loss, threshold=ends.threshold)
+    result = finish(robot, world, found, chosen, q_start, key, config)
+
+    # A path that the exact check refuses is sought again, farther away from obstacles.
+    for again in range(1, MAX_REPLANS):
         if result.status is not Status.NOT_VERIFIED:
             break
         key = jax.random.fold_in(key, again)
         idle = dataclasses.replace(found, compile_s=0.0, search_s=0.0)
         rest = time_left(config, result.timing["search_s"])
-        wary = with_margin(world, again * WARY)
-        other, path = _connected(wary, idle, q_start, target, key, rest)
-        other = finish(robot, wary, other, path, target, loss, goal_loss, key, config, q_start)
+        wary = with_margin(world, again * MARGIN_STEP)
+        other, path = _connect(wary, idle, q_start, target, key, rest)
+        chosen = dataclasses.replace(chosen, path=path)
+        other = finish(robot, wary, other, chosen, q_start, key, config)
+        other = dataclasses.replace(other, expansions=0)  # of the same search
         result = with_time_of(other if other.ok else result, result, other)
-    return dataclasses.replace(result, alternatives=q[alike], search_goal_loss=search_goal_loss)
+
+    matching = [k for k in ends.rivals if ends.loss[k] <= ends.threshold]
+    alike = [k for k in matching if k != end and ends.cost[k] <= AMBIGUITY_RATIO * ends.cost[end]]
+    return dataclasses.replace(
+        result, alternatives=ends.q[alike], search_match_threshold=search_threshold
+    )
 
 
-def _distinct(
+def _choose_ends(
+    world: World,
+    problem: VisualProblem,
+    found: SearchResult,
+    q_start: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+) -> tuple[SearchResult, Ends]:
+    """The ends of a search, polished if there is time; that time is added to the search's."""
+    score, q = np.asarray(found.tree.score), np.asarray(found.tree.q)
+    threshold, polishing = float(problem.goal.threshold), problem.polishing
+    ended_early = found.stopped in EARLY_STOPS
+    if polishing is not None and not ended_early:
+        nodes = _best_nodes(world, score, q, q_start, config.polish.hypotheses, np.inf)
+        seed = int(jax.random.bits(key, dtype=jnp.uint32))
+        polished, compile_s, polish_s = timed(
+            lambda: polish(world, polishing, q[nodes], seed), evaluate_cost, linearize
+        )
+        found = dataclasses.replace(
+            found, compile_s=found.compile_s + compile_s, search_s=found.search_s + polish_s
+        )
+        return found, _polished_ends(world, polished, polishing.threshold, q_start, config)
+    if ended_early and score.min() > threshold:
+        # Nothing matches: the best node that a path leads to.
+        score = np.where(np.asarray(found.tree.cost) < trees.UNREACHED, score, np.inf)
+    order = _best_nodes(world, score, q, q_start, MAX_GOALS, threshold)
+    paths = {end: trees.branch_path(found.tree, end) for end in order}
+    paths = {end: path for end, path in paths.items() if np.array_equal(path[0], q_start)}
+    # On a small image even neighbors look the same: there are no rivals to name.
+    return found, Ends(
+        q=q, loss=score, cost=score, order=order, rivals=[], paths=paths, threshold=threshold
+    )
+
+
+def _polished_ends(
+    world: World,
+    polished: Polished,
+    threshold: float,
+    q_start: np.ndarray,
+    config: PlannerConfig,
+) -> Ends:
+    """Polished configurations in the order in which they are tried."""
+    # Of two that look alike, the nearer to the start is likelier; a match goes before all others.
+    far = distances_to(world, polished.q, q_start) ** 2
+    preference = polished.cost * (1.0 + config.match.start_preference * far)
+    order = np.lexsort([preference, polished.loss > threshold])
+    rivals = [int(k) for k in order if np.isfinite(polished.cost[k])] or [0]
+    matched = [k for k in rivals if polished.loss[k] <= threshold]
+    return Ends(
+        q=polished.q,
+        loss=polished.loss,
+        cost=polished.cost,
+        order=matched or rivals,
+        rivals=rivals,
+        paths={},
+        threshold=threshold,
+    )
+
+
+def _best_nodes(
     world: World,
     score: np.ndarray,
     q: np.ndarray,
     q_start: np.ndarray,
-    most: int,
-    goal_loss: float,
-) -> Iterator[int]:
-    """Where to end: as good as the best, nearest to the start first; then other matches."""
-    open_nodes = np.flatnonzero(np.isfinite(score) & (score <= max(goal_loss, score.min())))
-    for _ in range(most):
-        if len(open_nodes) == 0:
-            return
-        # Nodes just under the bar would be nearer still, but only as they are not there yet.
-        equal = open_nodes[score[open_nodes] <= SAME_LOSS * score[open_nodes].min()]
-        best = int(equal[np.argmin(apart(world, q[equal], q_start))])
-        yield best
-        open_nodes = open_nodes[apart(world, q[open_nodes], q[best]) > DISTINCT]
+    num: int,
+    threshold: float,
+) -> list[int]:
+    """Distinct nodes: as good as the best, nearest to the start first; then other matches."""
+
+    def nearest_of_the_best(candidates: np.ndarray) -> int:
+        # Nodes just under the threshold would be nearer still, but only as they are not there yet.
+        equal = candidates[score[candidates] <= SAME_LOSS * score[candidates].min()]
+        return int(equal[np.argmin(distances_to(world, q[equal], q_start))])
+
+    matching = np.flatnonzero(np.isfinite(score) & (score <= max(threshold, score.min())))
+    return distinct(world, q, matching, num, nearest_of_the_best)
 
 
 def _straight(
@@ -133,20 +215,25 @@ def _straight(
 ) -> tuple[SearchResult, np.ndarray | None]:
     """The straight path (2, D) if it is free; the time for the check is added to the search's.
 
-    The exact check judges, which also grants what the covering spheres refuse.
+    The exact check judges, which also grants what the covering spheres refuse. A world with an
+    ``is_free`` of its own is asked as well.
     """
     obstacles = obstacle_list(world)
     exact_scene(robot, obstacles)  # built once, and no part of any search
     started = time.perf_counter()
     path = np.stack([q_start, q_goal])
-    seen = verify_path(robot, obstacles, path, step=GLANCE)
-    clear = seen.ok and not seen.clearance < world.margin + GRAZE
+    seen = verify_path(robot, obstacles, path, step=SWEEP_STEP)
+    clear = seen.ok and not seen.clearance < world.margin + SWEEP_MARGIN
+    if clear and overrides_is_free(world):
+        edge = world.edge(jnp.asarray(path[:1]), jnp.asarray(path[1:]))
+        steps = max(int(np.ceil(float(world.span(edge)[0] / world.resolution))), 1)
+        clear = int(free_prefix(world, jnp.asarray(path[:1]), edge, steps)[0]) == steps
     spent_s = time.perf_counter() - started
     found = dataclasses.replace(found, search_s=found.search_s + spent_s)
     return found, path if clear else None
 
 
-def _connected(
+def _connect(
     world: World,
     found: SearchResult,
     q_start: np.ndarray,
@@ -158,126 +245,83 @@ def _connected(
 
     If time is up meanwhile, or the user interrupts, the search has stopped for that.
     """
-    policy = RRTConnect(lanes=config.lanes)
-    tree = policy.forest(jnp.asarray(q_start), jnp.asarray(q_goal), config.capacity)
-    stop = make_termination(0.0, max_iterations=config.connect_iterations)
-    limit_s = time_left(config, found.search_s).time_limit_s
-    connection = search(world, policy, tree, key=key, stop=stop, time_limit_s=limit_s)
+    goal, policy = ConfigurationGoal(q=jnp.asarray(q_goal)), RRTConnect(lanes=config.tree.lanes)
+    connection = search(
+        world,
+        goal,
+        policy,
+        policy.init(world, goal, q_start[None], config.tree.capacity),
+        key=key,
+        termination=make_termination(
+            policy.goal_score(goal), max_iterations=config.budget.connect_iterations
+        ),
+        time_limit_s=time_left(config, found.search_s).budget.time_limit_s,
+    )
     found = dataclasses.replace(
         found,
-        stopped=connection.stopped if connection.stopped in HURRIED else found.stopped,
+        stopped=connection.stopped if connection.stopped in EARLY_STOPS else found.stopped,
         compile_s=found.compile_s + connection.compile_s,
         search_s=found.search_s + connection.search_s,
     )
-    return found, connection_path(connection.tree)
-
-
-def _polished(
-    found: SearchResult, world: World, polishing: Polishing, q: np.ndarray, key: jax.Array
-) -> tuple[SearchResult, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """What :func:`polish` returns; its time is added to the search's."""
-    seed = int(jax.random.bits(key, dtype=jnp.uint32))
-    result, compile_s, polish_s = timed(lambda: polish(world, polishing, q, seed), glance, look_at)
-    compile_s, search_s = found.compile_s + compile_s, found.search_s + polish_s
-    found = dataclasses.replace(found, compile_s=compile_s, search_s=search_s)
-    return found, result
+    return found, policy.extract_path(connection.tree)
 
 
 def time_left(config: PlannerConfig, spent_s: float) -> PlannerConfig:
     """The same settings, with what is left of the time."""
-    return dataclasses.replace(config, time_limit_s=max(0.0, config.time_limit_s - spent_s))
-
-
-def with_time_of(result: PlanResult, *results: PlanResult) -> PlanResult:
-    """A result that took the time of all."""
-    timing = {name: sum(r.timing[name] for r in results) for name in result.timing}
-    return dataclasses.replace(result, timing=timing)
-
-
-def timed(run: Callable[[], Any], *programs: Any) -> tuple[Any, float, float]:
-    """The result of a run, and the seconds that compiling these jitted functions took, and it."""
-
-    def clocked() -> tuple[Any, float]:
-        started = time.perf_counter()
-        result = jax.block_until_ready(run())
-        return result, time.perf_counter() - started
-
-    def compiled() -> int:
-        return sum(program._cache_size() for program in programs)
-
-    before = compiled()
-    result, first_s = clocked()
-    if compiled() == before:
-        return result, 0.0, first_s
-    result, run_s = clocked()
-    return result, first_s - run_s, run_s
+    left_s = max(0.0, config.budget.time_limit_s - spent_s)
+    return config.changed({"budget.time_limit_s": left_s})
 
 
 def finish(
     robot: Robot,
     world: World,
     found: SearchResult,
-    raw_path: np.ndarray | None,
-    target: np.ndarray,
-    loss: float,
-    goal_loss: float,
+    chosen: Chosen,
+    q_start: np.ndarray,
     key: jax.Array,
     config: PlannerConfig,
-    q_start: np.ndarray,
 ) -> PlanResult:
-    """Shorten and verify; if the shortened path fails the exact check, fall back on the raw one.
+    """Shorten and verify the chosen path, and say what became of the plan.
 
     Without a path the result is the start alone.
+
+    Args:
+        robot: whose path it is.
+        world: robot and obstacles.
+        found: the search.
+        chosen: where to, and the raw path.
+        q_start: (D,).
+        key: random key of shortcutting.
+        config: settings.
     """
-    has_path, hurried = raw_path is not None, found.stopped in HURRIED
-    raw_path = q_start[None] if raw_path is None else raw_path
-    started = time.perf_counter()
-    shortcut(world, raw_path, key=key, rounds=0)
-    shortcut_compile_s = time.perf_counter() - started
-    started = time.perf_counter()
-    path = unwrapped(world, shortcut(world, raw_path, key=key, rounds=config.shortcut_rounds))
-    shortcut_s = time.perf_counter() - started
-
-    started = time.perf_counter()
-    obstacles = obstacle_list(world)
-    verification = verify_path(robot, obstacles, path, step=config.verify_step)
-    if not verification.ok:
-        longer = unwrapped(world, raw_path)
-        raw = verify_path(robot, obstacles, longer, step=config.verify_step)
-        if raw.ok:
-            path, verification = longer, raw
-    verify_s = time.perf_counter() - started
-
-    if has_path and loss <= goal_loss and verification.ok:
+    done = unchecked(q_start[None])
+    if chosen.path is not None:
+        done = postprocess(
+            world,
+            chosen.path,
+            lambda path: check_path(robot, world, path, step=config.budget.verify_step),
+            key=key,
+            rounds=config.budget.shortcut_rounds,
+        )
+    matched = chosen.loss <= chosen.threshold
+    if matched and done.is_verified:
         status = Status.SOLVED
-    elif hurried:
+    elif found.stopped in EARLY_STOPS:
         status = STATUS_OF[found.stopped]
-    elif not has_path:
+    elif chosen.path is None:
         status = Status.NO_PATH
-    elif loss > goal_loss:
+    elif not matched:
         status = STATUS_OF.get(found.stopped, Status.NO_MATCH)
     else:
         status = Status.NOT_VERIFIED
-    rejected = np.asarray(found.tree.rejected)
-    return PlanResult(
+    return plan_result(
+        world,
+        found,
+        done,
         status=status,
-        path=path,
-        raw_path=raw_path,
-        target=target,
-        alternatives=target[None][:0],
-        loss=loss,
-        goal_loss=goal_loss,
-        search_goal_loss=goal_loss,
-        cost=path_length(world, path),
-        verification=verification,
-        rejected={reason.name.lower(): int(rejected[reason]) for reason in Rejection},
-        iterations=int(found.tree.iteration),
-        timing={
-            "compile_s": found.compile_s + shortcut_compile_s,
-            "search_s": found.search_s,
-            "shortcut_s": shortcut_s,
-            "verify_s": verify_s,
-        },
-        history=found.history,
-        tree=found.tree,
+        advice=ADVICE[status],
+        target=chosen.target,
+        loss=chosen.loss,
+        match_threshold=chosen.threshold,
+        lanes=config.tree.lanes,
     )

@@ -1,4 +1,4 @@
-"""From images and settings to the policies that compare with them."""
+"""Image goals: what users give, and what the planner compares with at one resolution."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,188 +8,132 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax import checks
-from vrrt_jax.config import PlannerConfig
-from vrrt_jax.core.search import Termination, make_termination
+from vrrt_jax.core.goal import LeastSquaresGoal
+from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import batch_link_poses
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.splat.images import prepare_goal
+from vrrt_jax.splat.loss import goal_loss, weighted_goal, weighted_image
 from vrrt_jax.splat.model import SelfModel
-from vrrt_jax.splat.raster import LANES, Windows, choose_windows
-from vrrt_jax.splat.types import Camera, SplatModel
-from vrrt_jax.visual.policy import Probing, VisualPolicy
-from vrrt_jax.visual.polish import Closer, CloseUp, Polishing
+from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
+from vrrt_jax.splat.windows import Windows, choose_windows
 
 LEAST_HEIGHT = 0.75  # of an image for a close-up, in units of the height that it is meant for
 
 
-class Sight:
-    """A robot's goal images, to be compared with at any resolution.
+@pytree
+class ImageObjective(LeastSquaresGoal):
+    """An image goal at one resolution: a goal of the kernel.
 
-    Args:
-        robot: the robot.
-        self_model: how it looks.
-        camera: of the goal image; or V of them.
-        goal_image: as for :func:`vrrt_jax.plan`; or V of them.
-        mask: pixels that are compared, None for all; or V of them.
+    A subclass may override :meth:`loss` or :meth:`residual`; see
+    :class:`~vrrt_jax.core.goal.LeastSquaresGoal`.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        self_model: SelfModel,
-        camera: Camera | Sequence[Camera],
-        goal_image: Any,
-        mask: Any = None,
-    ):
-        """Raise a ValueError if the self-model is of another robot."""
-        checks.check_self_model(robot, self_model)
-        if isinstance(camera, Camera):
-            camera, goal_image, mask = [camera], [goal_image], None if mask is None else [mask]
-        self.robot, self.self_model = robot, self_model
-        self.cameras, self.images, self.masks = camera, goal_image, mask
+    splats: SplatModel
+    windows: Windows | None  # how the rasterizer cuts its work, for these splats
+    cameras: Camera  # leading axis V
+    image: GoalImage
+    threshold: Any  # () loss of a match
 
-    def at(self, image_px: int, match_scale: float) -> tuple[dict[str, Any], float]:
-        """Fields of a :class:`VisualPolicy` for images of a height, and the loss of a match.
+    def loss(self, world: Any, q: jax.Array) -> jax.Array:
+        """Mean squared error () of the rendered configuration (D,)."""
+        return goal_loss(world.chain, self.splats, self.cameras, self.image, q, self.windows)
 
-        Raises:
-            ValueError: the masks leave nothing of the robot.
-        """
-        goal, cameras = prepare_goal(self.images, self.cameras, image_px, self.masks)
-        if not jnp.any(goal.valid * goal.coverage > 0):
-            raise ValueError(
-                f"the masks leave nothing of the robot on images of {goal.coverage.shape[1]} px; "
-                "a larger image_px, probe_px and polish_px keep more where many pixels are hidden"
-            )
-        level = self.self_model.level_for(goal.coverage.shape[1])
-        splats, windows = _windowed(self.robot, level.splats, cameras)
-        covered = float(jnp.sum(goal.valid * goal.coverage) / jnp.sum(goal.valid))
-        fields = {"splats": splats, "windows": windows, "cameras": cameras, "goal": goal}
-        return fields, match_scale * level.match_threshold * covered
+    def prediction(self, world: Any, q: jax.Array) -> jax.Array:
+        """The rendered configuration (D,) as a weighted vector (V * H * W * 4,)."""
+        return weighted_image(world.chain, self.splats, self.cameras, self.image, q, self.windows)
 
-    def close_up(self, policy: VisualPolicy, image_px: int, match_scale: float) -> CloseUp | None:
-        """How to look at a part of images of a height; not at all, where they are much smaller."""
-        goal, cameras = prepare_goal(self.images, self.cameras, image_px, self.masks)
-        if goal.coverage.shape[1] < LEAST_HEIGHT * image_px:
-            return None
-        level = self.self_model.close_up
-        seen = {"splats": level.splats, "windows": None, "cameras": cameras, "goal": goal}
-        return CloseUp(
-            policy=dataclasses.replace(policy, **seen),
-            px=level.size_px,
-            match_threshold=match_scale * level.match_threshold,
-        )
+    def target(self) -> jax.Array:
+        """The goal images as a weighted vector (V * H * W * 4,)."""
+        return weighted_goal(self.image)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Setup:
-    """A visual problem, ready to be searched."""
+class CloseUp:
+    """The goal images in full detail, of which a part around the outermost link is compared."""
 
-    policy: VisualPolicy
-    goal_loss: float  # that counts as matched
-    probing: Probing
-    polishing: Polishing | None
-
-
-def visual_setup(sight: Sight, q_start: np.ndarray, config: PlannerConfig) -> Setup:
-    """All that :func:`vrrt_jax.plan` needs, at the resolutions of a configuration."""
-    policy, goal_loss = visual_policy(sight, q_start, config)
-    return Setup(
-        policy=policy,
-        goal_loss=goal_loss,
-        probing=visual_probing(sight, policy, config),
-        polishing=(
-            visual_polishing(sight, policy, goal_loss, q_start, config)
-            if config.hypotheses
-            else None
-        ),
-    )
+    objective: ImageObjective  # of the whole images; its threshold is not used
+    px: int  # height and width of the part
+    threshold: float  # loss of a match, in units of the part's covered share
 
 
-def visual_policy(
-    sight: Sight, q_start: np.ndarray, config: PlannerConfig
-) -> tuple[VisualPolicy, float]:
-    """The policy of the search, and the loss that counts as matched."""
-    fields, goal_loss = sight.at(config.image_px, config.match_scale)
-    checks.check_cameras(sight.robot, fields["splats"], fields["cameras"], q_start)
-    numbers = {
-        "alpha": config.alpha,
-        "epsilon": config.epsilon,
-        "kappa": config.kappa,
-        "eta": config.eta,
-        "exploration": config.exploration,
-        "beta1": config.beta1,
-        "beta2": config.beta2,
-        "anneal_loss": config.anneal * goal_loss,
-        "rewire_radius": config.rewire_radius,
-    }
-    policy = VisualPolicy(
-        **fields,
-        **{name: jnp.float32(value) for name, value in numbers.items()},
-        inherit=jnp.asarray(config.inherit),
-        rewiring=config.rewiring,
-        lanes=config.lanes,
-    )
-    return policy, goal_loss
+@dataclasses.dataclass(frozen=True)
+class ImageGoal:
+    """The robot should look like one image, or like several from several cameras.
 
+    Raises nothing by itself: :func:`vrrt_jax.plan` checks it against the robot.
+    """
 
-def visual_probing(sight: Sight, policy: VisualPolicy, config: PlannerConfig) -> Probing:
-    """Where to look before the search."""
-    fields, _ = sight.at(config.probe_px, config.match_scale)
-    coarse = dataclasses.replace(policy, **fields, alpha=jnp.float32(config.probe_alpha))
-    kept = min(config.probes, config.probes_kept)
-    parts = -(-kept // LANES)
-    return Probing(
-        policy=coarse,
-        radius=jnp.float32(config.probe_radius),
-        rounds=jnp.int32(config.probe_rounds),
-        steps=jnp.int32(config.probe_steps),
-        parts=parts,
-        num=-(-config.probes // max(parts, 1)),
-        kept=-(-kept // max(parts, 1)),
-    )
+    self_model: SelfModel  # how the robot looks
+    camera: Camera | Sequence[Camera]  # the view of the image; or V of them
+    # (H, W, 4) RGB and mask, or (H, W, 3) on a plain background; uint8, or float in [0, 1]; or V
+    image: np.ndarray | Sequence[np.ndarray]
+    # (H, W) bool, True for the pixels that are compared, where not all are; or V of them
+    mask: np.ndarray | Sequence[np.ndarray] | None = None
+    objective: type[ImageObjective] = ImageObjective  # a subclass may change the loss
 
+    @property
+    def views(self) -> tuple[list[Camera], list[np.ndarray], list[np.ndarray] | None]:
+        """Cameras, images and masks of V views."""
+        if isinstance(self.camera, Camera):
+            masks = None if self.mask is None else [np.asarray(self.mask)]
+            return [self.camera], [self.image], masks  # type: ignore[list-item] - one image
+        masks = None if self.mask is None else list(self.mask)
+        return list(self.camera), list(self.image), masks
 
-def visual_polishing(
-    sight: Sight,
-    policy: VisualPolicy,
-    coarse_goal_loss: float,
-    q_start: np.ndarray,
-    config: PlannerConfig,
-) -> Polishing:
-    """How matches are looked at after the search."""
-    fields, goal_loss = sight.at(config.polish_px, config.match_scale)
-    close_px, match_scale = config.close_px, config.match_scale
+    def at(self, robot: Robot, image_px: int, match_scale: float = 1.0) -> ImageObjective:
+        """The goal on images of one height.
 
-    def closer(policy: VisualPolicy, goal_loss: float) -> Closer:
-        prior = jnp.float32(config.start_prior * goal_loss)
-        return Closer(policy=policy, q_start=jnp.asarray(q_start), prior=prior)
+        Args:
+            robot: whose goal it is.
+            image_px: height that the images are shrunk to [px].
+            match_scale: the threshold, in units of the self-model's calibrated one.
 
-    return Polishing(
-        coarse=closer(policy, coarse_goal_loss),
-        fine=closer(dataclasses.replace(policy, **fields), goal_loss),
-        close_up=sight.close_up(policy, close_px, match_scale) if close_px else None,
-        coarse_goal_loss=coarse_goal_loss,
-        goal_loss=goal_loss,
-        samples=config.polish_samples,
-        lanes=config.polish_lanes,
-        kept=config.polish_kept,
-        rounds=config.polish_rounds,
-        spread=config.polish_spread,
-        steps=config.polish_steps,
-    )
+        Raises:
+            ValueError: an image, a camera or a mask makes no sense, or the masks leave nothing of
+                the robot.
+        """
+        cameras, images, masks = self.views
+        image, shrunk_cameras = prepare_goal(images, cameras, image_px, masks)
+        if not jnp.any(image.valid * image.alpha > 0):
+            raise ValueError(
+                f"the masks leave nothing of the robot on images of {image.alpha.shape[1]} px; "
+                "larger tree.image_px, seeds.px and polish.px keep more where many are hidden"
+            )
+        level = self.self_model.level_for(image.alpha.shape[1])
+        splats, windows = _windowed(robot, level.splats, shrunk_cameras)
+        # The calibrated threshold is in units of the share of the image that the robot covers.
+        covered = float(jnp.sum(image.valid * image.alpha) / jnp.sum(image.valid))
+        return self.objective(
+            splats=splats,
+            windows=windows,
+            cameras=shrunk_cameras,
+            image=image,
+            threshold=match_scale * level.match_threshold * covered,
+        )
 
+    def close_up(self, image_px: int, match_scale: float = 1.0) -> CloseUp | None:
+        """The goal for a close-up of the hand; None where the images are much smaller.
 
-def visual_termination(config: PlannerConfig, goal_loss: float) -> Termination:
-    """When the search ends."""
-    return make_termination(
-        goal_loss,
-        settle=config.settle,
-        max_iterations=config.max_iterations,
-        patience=config.patience,
-        min_improvement=config.min_improvement,
-        min_ratio=config.min_ratio,
-    )
+        Args:
+            image_px: height of the whole images that the close-up is cut from [px].
+            match_scale: see :meth:`at`.
+        """
+        cameras, images, masks = self.views
+        image, shrunk_cameras = prepare_goal(images, cameras, image_px, masks)
+        if image.alpha.shape[1] < LEAST_HEIGHT * image_px:
+            return None
+        level = self.self_model.close_up
+        objective = self.objective(
+            splats=level.splats,
+            windows=None,
+            cameras=shrunk_cameras,
+            image=image,
+            threshold=0.0,
+        )
+        return CloseUp(
+            objective=objective, px=level.size_px, threshold=match_scale * level.match_threshold
+        )
 
 
 def _windowed(

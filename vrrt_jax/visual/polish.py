@@ -1,143 +1,134 @@
-"""Tell apart what a small image cannot: matched configurations, looked at more closely.
+"""Least squares on the ends of a search: tell apart what a small image cannot.
 
 Many configurations look nearly like the goal: half a turn of a gripper, another elbow, a wrist that
-makes up for another. Each is a valley of the loss of its own, which gradients do not leave. So
-samples spread widely around the best nodes of a search, with some joints moved and others not, and
-all descend by Levenberg-Marquardt, for which with few joints forward renders suffice. The distinct
-ends start the next round. The last of them descend on a larger image with more splats, which tells
-what the small one does not, and then on a close-up of the hand beside it, where half a turn becomes
+makes up for another. Each is a local minimum of the loss, which gradients do not leave. So samples
+spread widely around the best nodes of a search, with some joints moved and others not, and all
+descend by Levenberg-Marquardt, for which with few joints forward renders suffice. The distinct ends
+start the next round. The last of them descend on a larger image with more splats, which tells what
+the small one does not, and then on a close-up of the hand beside it, where half a turn becomes
 visible. What no image tells stays near the start: a weak prior sees to that.
 """
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.config import PolishConfig
 from vrrt_jax.core.edges import difference, enforce_bounds
 from vrrt_jax.core.parallel import map_on_threads
 from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import link_poses
-from vrrt_jax.scene.world import World, is_free
+from vrrt_jax.scene.world import World
 from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.images import cut_goal
-from vrrt_jax.splat.loss import weighted_goal, weighted_image
-from vrrt_jax.splat.raster import map_lanes
+from vrrt_jax.splat.lanes import map_lanes
 from vrrt_jax.splat.types import Camera, SplatModel
-from vrrt_jax.visual.policy import VisualPolicy
+from vrrt_jax.visual.distinct import distinct, steps_between
+from vrrt_jax.visual.goal import CloseUp
 
-LOOKS = 4  # configurations looked at in one call: with their differences, a batch of renders
-CLOSE_LOOKS = 2  # the same at a close-up: few ends are left, and each core takes some
-GLANCES = 32  # configurations whose cost alone is asked for, in one call
-PROBE = 2e-4  # [rad] step of the finite differences; longer ones lose the weak directions
+LINEARIZE_BATCH = 4  # configurations in one call: with their differences, a batch of renders
+CLOSE_UP_BATCH = 2  # the same at a close-up: few ends are left, and each core takes some
+EVALUATE_BATCH = 32  # configurations whose cost alone is asked for, in one call
+FD_STEP = 2e-4  # [rad] step of the finite differences; longer ones lose the weak directions
 RIDGE = 1e-7  # keeps joints that no pixel sees where they are
-LONGEST = 0.3  # [rad] of one step of a joint
+MAX_STEP = 0.3  # [rad] of one step of a joint
 FEWEST_MOVED = 0.2  # share of its joints that a sample moves, at least, on average
 TURNS = 12  # in which the last joint goes all the way round
-NARROWER = 0.5  # how far samples spread in a round, in units of the round before
+SPREAD_DECAY = 0.5  # how far samples spread in a round, in units of the round before
 LEAST_COVERED = 0.01  # share of a close-up; a hand that is hidden tells nothing
-DISTINCT = 0.3  # [rad] distance at which configurations count as different
 
 
 @pytree
-class Closer:
-    """A look at the goal."""
+class PriorGoal:
+    """A goal, and a weak preference for configurations near the start."""
 
-    policy: VisualPolicy  # only its loss is used
+    goal: Any  # with ``loss`` and ``residual``
     q_start: jax.Array  # (D,)
-    prior: jax.Array  # () loss that a radian away from the start costs
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CloseUp:
-    """How to look at the outermost link alone, in full detail."""
-
-    policy: VisualPolicy  # only its loss is used; it sees whole images, of which a part is cut
-    px: int  # height and width of the part
-    match_threshold: float  # loss of a match, in units of the part's covered share
+    prior: jax.Array  # () cost of a radian away from the start
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Polishing:
-    """How configurations are polished."""
+    """On which images configurations are polished, and how."""
 
-    coarse: Closer  # samples descend on this image
-    fine: Closer  # and the last of them on this one
+    coarse: PriorGoal  # samples descend on this one
+    fine: PriorGoal  # and the last of them on this one
     close_up: CloseUp | None  # and their hands at last here
-    coarse_goal_loss: float  # that counts as matched on the coarse image
-    goal_loss: float  # and on the fine one
-    samples: int  # of a round, in all
-    lanes: int  # best of them, which descend
-    kept: int  # distinct configurations that leave a round
-    rounds: int  # of spreading and descending, each less widely; twice as many if nothing matches
-    spread: float  # standard deviation of a joint that moves, in the first round [rad]
-    steps: int  # that each descends, in every round and on the fine image
+    config: PolishConfig
+
+    @property
+    def threshold(self) -> float:
+        """Loss of a match on the fine image."""
+        return float(self.fine.goal.threshold)
 
 
-class _Look(NamedTuple):
-    """What is seen of n configurations."""
+class _GaussNewtonModel(NamedTuple):
+    """The cost of n configurations, and its quadratic model around each."""
 
     q: np.ndarray  # (n, D)
-    loss: np.ndarray  # (n,) of the image alone
+    loss: np.ndarray  # (n,) of the goal alone
     cost: np.ndarray  # (n,) and with the prior
     matrix: np.ndarray  # (n, D, D) of Gauss and Newton, half of the cost's second derivatives
     slope: np.ndarray  # (n, D) half of its first
     free: np.ndarray  # (n,) bool
 
 
-def polish(
-    world: World, polishing: Polishing, q: np.ndarray, seed: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spread configurations (H, D) and descend.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Polished:
+    """Distinct ends of polishing, best first."""
 
-    Returns:
-        Distinct configurations (at most kept, D), best first; their losses on the fine image; and
-        their costs, those of a close-up included, infinite in collision.
+    q: np.ndarray  # (n, D)
+    loss: np.ndarray  # (n,) on the fine image
+    cost: np.ndarray  # (n,) with the prior and the close-up, infinite in collision
+
+
+def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Polished:
+    """Spread samples around configurations (H, D) and descend.
+
+    Args:
+        world: robot and obstacles.
+        polishing: the goal at each resolution.
+        q: (H, D) hypotheses.
+        seed: of the samples.
     """
     rng = np.random.default_rng(seed)
-    coarse, fine, steps = polishing.coarse, polishing.fine, polishing.steps
-    for k in range(2 * polishing.rounds):
-        spread = polishing.spread * NARROWER ** min(k, polishing.rounds - 1)
-        samples = _spread(q, _last_hinge(world), polishing.samples, spread, rng)
-        cost = _in_blocks(glance, world, coarse, samples, GLANCES)[0]
-        best = samples[np.argsort(cost, kind="stable")[: polishing.lanes]]
-        ends = _descend(lambda q: _look(world, coarse, q), best, steps)
-        kept = _distinct(world, ends, polishing.kept)
-        q, matched = kept.q, np.any(kept.free & (kept.cost <= polishing.coarse_goal_loss))
-        if matched and k + 1 >= polishing.rounds:
+    config, coarse, fine = polishing.config, polishing.coarse, polishing.fine
+
+    # Rounds on the coarse image: sample, keep the best, descend, keep distinct ends.
+    for k in range(2 * config.rounds):
+        spread = config.spread * SPREAD_DECAY ** min(k, config.rounds - 1)
+        samples = _sample_around(q, _last_hinge(world), config.samples, spread, rng)
+        cost = _in_batches(evaluate_cost, world, coarse, samples, EVALUATE_BATCH)[0]
+        best = samples[np.argsort(cost, kind="stable")[: config.lanes]]
+        ends = _descend(lambda q: _linearize(world, coarse, q), best, config.steps)
+        kept = _distinct_ends(world, ends, config.kept)
+        q = kept.q
+        matched = np.any(kept.free & (kept.cost <= float(coarse.goal.threshold)))
+        if matched and k + 1 >= config.rounds:
             break
-    turned = _turned(world, fine, q, polishing.kept)
-    ends = _descend(lambda q: _look(world, fine, q), turned, steps)
-    kept = _distinct(world, ends, polishing.kept)
+
+    # The fine image, from every minimum over a whole turn of the last joint.
+    turned = _turns_of_last_hinge(world, fine, q, config.kept)
+    ends = _descend(lambda q: _linearize(world, fine, q), turned, config.steps)
+    kept = _distinct_ends(world, ends, config.kept)
     loss = kept.loss
+
+    # The close-up of the hand, together with the fine image.
     if polishing.close_up is not None:
-        ends = _descend_closely(world, polishing, polishing.close_up, kept)
-        kept = _distinct(world, ends, polishing.kept)
-        loss = _look(world, fine, kept.q).loss
-    return kept.q, loss, np.where(kept.free, kept.cost, np.inf)
+        ends = _descend_close_up(world, polishing, polishing.close_up, kept)
+        kept = _distinct_ends(world, ends, config.kept)
+        loss = _linearize(world, fine, kept.q).loss
+    return Polished(q=kept.q, loss=loss, cost=np.where(kept.free, kept.cost, np.inf))
 
 
-def _distinct(world: World, look: _Look, num: int) -> _Look:
+def _distinct_ends(world: World, model: _GaussNewtonModel, num: int) -> _GaussNewtonModel:
     """At most num, the free ones first and by rising cost; of near ones only the first."""
-    rows: list[int] = []
-    for k in np.lexsort([look.cost, ~look.free]):
-        if np.all(apart(world, look.q[rows], look.q[k]) > DISTINCT):
-            rows.append(k)
-    return _Look(*(column[rows[:num]] for column in look))
-
-
-def apart(world: World, q: np.ndarray, q_other: np.ndarray) -> np.ndarray:
-    """Distances (n,) of configurations (n, D) from another (D,), the short way round."""
-    return np.linalg.norm(_steps(world, q_other, q), axis=1)
-
-
-def _steps(world: World, q_from: np.ndarray, q_to: np.ndarray) -> np.ndarray:
-    """From configurations (n, D) to others, the short way round."""
-    step = q_to - q_from
-    return step - 2 * np.pi * np.round(step / (2 * np.pi)) * np.asarray(world.is_continuous)
+    rows = distinct(world, model.q, np.lexsort([model.cost, ~model.free]), num)
+    return _GaussNewtonModel(*(column[rows] for column in model))
 
 
 def _last_hinge(world: World) -> int:
@@ -146,20 +137,21 @@ def _last_hinge(world: World) -> int:
     return int(hinges[-1]) if len(hinges) else -1
 
 
-def _spread(
+def _sample_around(
     q: np.ndarray, hinge: int, num: int, spread: float, rng: np.random.Generator
 ) -> np.ndarray:
     """Samples (num, D) around configurations (H, D), which are the first of them."""
     # Grippers look alike after half a turn of the last joint.
     turned = q.copy()
     turned[:, hinge] += np.where(q[:, hinge] > 0, -np.pi, np.pi)
+    # Each sample moves a random share of its joints.
     shape = (-(-num // len(q)), *q.shape)
     moved = rng.uniform(size=shape) < rng.uniform(FEWEST_MOVED, 1.0, (*shape[:2], 1))
     around = q + spread * moved * rng.normal(size=shape)
     return np.concatenate([q, turned, around.reshape(-1, q.shape[1])])[:num]
 
 
-def _turned(world: World, closer: Closer, q: np.ndarray, num: int) -> np.ndarray:
+def _turns_of_last_hinge(world: World, goal: PriorGoal, q: np.ndarray, num: int) -> np.ndarray:
     """The best (at most num, D) of configurations (H, D) and their minima over the last joint.
 
     Its turn is what images tell least: a gripper spins about its axis and hardly changes.
@@ -167,24 +159,27 @@ def _turned(world: World, closer: Closer, q: np.ndarray, num: int) -> np.ndarray
     joints = q.shape[1]
     turn = 2 * np.pi / TURNS * np.arange(TURNS)
     around = (q[:, None] + turn[:, None] * np.eye(joints)[_last_hinge(world)]).reshape(-1, joints)
-    cost = _in_blocks(glance, world, closer, around, GLANCES)[0].reshape(-1, TURNS)
-    allowed = (cost < np.roll(cost, 1, axis=1)) & (cost <= np.roll(cost, -1, axis=1))
-    allowed[:, 0] = True
-    order = np.argsort(np.where(allowed, cost, np.inf), axis=None, kind="stable")
-    return around[order[: min(num, np.sum(allowed))]]
+    cost = _in_batches(evaluate_cost, world, goal, around, EVALUATE_BATCH)[0].reshape(-1, TURNS)
+    # A turn is a minimum if both of its neighbors cost more; no turn at all is always one.
+    is_minimum = (cost < np.roll(cost, 1, axis=1)) & (cost <= np.roll(cost, -1, axis=1))
+    is_minimum[:, 0] = True
+    order = np.argsort(np.where(is_minimum, cost, np.inf), axis=None, kind="stable")
+    return around[order[: min(num, np.sum(is_minimum))]]
 
 
-def _descend_closely(world: World, polishing: Polishing, close_up: CloseUp, ends: _Look) -> _Look:
-    """Descend on the fine image and a close-up of the first one's hand together.
+def _descend_close_up(
+    world: World, polishing: Polishing, close_up: CloseUp, ends: _GaussNewtonModel
+) -> _GaussNewtonModel:
+    """Descend on the fine image and a close-up of the first end's hand together.
 
     The cost is the sum of both; the fine image's is taken for the parabola that it is around ends.
     """
-    closer, goal_loss = _at_hand(world, polishing.fine, close_up, ends.q[0])
-    weight = polishing.goal_loss / goal_loss
+    goal, threshold = _hand_goal(world, polishing.fine, close_up, ends.q[0])
+    weight = polishing.threshold / threshold
 
-    def look(q: np.ndarray) -> _Look:
-        near = _look(world, closer, q, CLOSE_LOOKS)
-        step = _steps(world, ends.q, near.q)
+    def linearize_both(q: np.ndarray) -> _GaussNewtonModel:
+        near = _linearize(world, goal, q, CLOSE_UP_BATCH)
+        step = steps_between(world, ends.q, near.q)
         bent = np.einsum("nij,nj->ni", ends.matrix, step)
         return near._replace(
             cost=ends.cost + np.sum(step * (bent + 2 * ends.slope), axis=1) + weight * near.loss,
@@ -192,20 +187,22 @@ def _descend_closely(world: World, polishing: Polishing, close_up: CloseUp, ends
             slope=ends.slope + bent + weight * near.slope,
         )
 
-    return _descend(look, ends.q, polishing.steps)
+    return _descend(linearize_both, ends.q, polishing.config.steps)
 
 
-def _at_hand(world: World, fine: Closer, close_up: CloseUp, q: np.ndarray) -> tuple[Closer, float]:
+def _hand_goal(
+    world: World, fine: PriorGoal, close_up: CloseUp, q: np.ndarray
+) -> tuple[PriorGoal, float]:
     """A close-up of the hand that a configuration (D,) has, and the loss of a match there."""
-    whole = close_up.policy
+    whole = close_up.objective
     middle = np.asarray(_hand_px(world, whole.splats, whole.cameras, q))
-    goal, cameras = cut_goal(whole.goal, whole.cameras, middle, close_up.px)
+    image, cameras = cut_goal(whole.image, whole.cameras, middle, close_up.px)
     # The fewer of its pixels are known, the less it says.
-    known = max(float(np.mean(goal.valid)), 1e-6)
-    covered = float(np.mean(goal.valid * goal.coverage)) / known
-    policy = dataclasses.replace(whole, goal=goal, cameras=cameras)
-    closer = dataclasses.replace(fine, policy=policy, prior=jnp.float32(0))
-    return closer, close_up.match_threshold * max(covered, LEAST_COVERED) / known
+    known = max(float(np.mean(image.valid)), 1e-6)
+    covered = float(np.mean(image.valid * image.alpha)) / known
+    objective = dataclasses.replace(whole, image=image, cameras=cameras)
+    goal = dataclasses.replace(fine, goal=objective, prior=jnp.float32(0))
+    return goal, close_up.threshold * max(covered, LEAST_COVERED) / known
 
 
 @jax.jit
@@ -217,19 +214,23 @@ def _hand_px(world: World, splats: SplatModel, cameras: Camera, q: jax.Array) ->
     return jax.vmap(project, (0, None))(cameras, pose[:3, :3] @ middle + pose[:3, 3])[0]
 
 
-def _descend(look: Callable[[np.ndarray], _Look], q: np.ndarray, steps: int) -> _Look:
+def _descend(
+    linearize: Callable[[np.ndarray], _GaussNewtonModel], q: np.ndarray, steps: int
+) -> _GaussNewtonModel:
     """Levenberg-Marquardt: steps that lower the cost; those that do not raise the damping."""
-    now = look(q)
+    now = linearize(q)
     damping = np.full(len(now.q), 1e-3)
     for _ in range(steps):
+        # Solve the damped normal equations of every configuration.
         diagonal = np.einsum("nii->ni", now.matrix)
         ridge = damping[:, None] * diagonal + RIDGE
         matrix = now.matrix + ridge[:, :, None] * np.eye(now.q.shape[1])
         change = -np.linalg.solve(matrix, now.slope[..., None])[..., 0]
-        tried = look(now.q + np.clip(change, -LONGEST, LONGEST))
+        tried = linearize(now.q + np.clip(change, -MAX_STEP, MAX_STEP))
+        # Take what is better; elsewhere go on from where it was, with shorter steps.
         better = tried.cost < now.cost
         damping *= np.where(better, 0.3, 4.0)
-        now = _Look(
+        now = _GaussNewtonModel(
             *(
                 np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
                 for new, old in zip(tried, now, strict=True)
@@ -238,52 +239,50 @@ def _descend(look: Callable[[np.ndarray], _Look], q: np.ndarray, steps: int) -> 
     return now
 
 
-def _look(world: World, closer: Closer, q: np.ndarray, size: int = LOOKS) -> _Look:
-    """Look at configurations (n, D)."""
-    return _Look(*_in_blocks(look_at, world, closer, q, size))
+def _linearize(
+    world: World, goal: PriorGoal, q: np.ndarray, size: int = LINEARIZE_BATCH
+) -> _GaussNewtonModel:
+    """The quadratic model around configurations (n, D)."""
+    return _GaussNewtonModel(*_in_batches(linearize, world, goal, q, size))
 
 
-def _in_blocks(
-    function: Callable, world: World, closer: Closer, q: np.ndarray, size: int
+def _in_batches(
+    function: Callable, world: World, goal: PriorGoal, q: np.ndarray, size: int
 ) -> list[np.ndarray]:
     """Arrays (n, ...) about configurations (n, D), a few at a time: one program serves any n."""
-    blocks = -(-len(q) // size)
-    padded = np.resize(q, (blocks * size, q.shape[1])).astype(np.float32)
-    seen = map_on_threads(lambda block: function(world, closer, block), np.split(padded, blocks))
-    return [np.concatenate(column)[: len(q)] for column in zip(*seen, strict=True)]
+    batches = -(-len(q) // size)
+    padded = np.resize(q, (batches * size, q.shape[1])).astype(np.float32)
+    found = map_on_threads(lambda batch: function(world, goal, batch), np.split(padded, batches))
+    return [np.concatenate(column)[: len(q)] for column in zip(*found, strict=True)]
 
 
 @jax.jit
-def glance(world: World, closer: Closer, q: jax.Array) -> tuple[jax.Array]:
-    """The cost alone (n,), see :class:`_Look`."""
+def evaluate_cost(world: World, goal: PriorGoal, q: jax.Array) -> tuple[jax.Array]:
+    """The cost alone (n,), see :class:`_GaussNewtonModel`."""
     q = enforce_bounds(world, q)
-    loss = map_lanes(lambda q: closer.policy.loss(world, q), q)
-    away = difference(world, closer.q_start, q)
-    return (loss + closer.prior * jnp.sum(away**2, axis=1),)
+    loss = map_lanes(lambda q: goal.goal.loss(world, q), q)
+    away = difference(world, goal.q_start, q)
+    return (loss + goal.prior * jnp.sum(away**2, axis=1),)
 
 
 @jax.jit
-def look_at(world: World, closer: Closer, q: jax.Array) -> tuple[jax.Array, ...]:
-    """Columns of a :class:`_Look`; derivatives are finite differences."""
-    policy, joints = closer.policy, q.shape[1]
+def linearize(world: World, goal: PriorGoal, q: jax.Array) -> tuple[jax.Array, ...]:
+    """Columns of a :class:`_GaussNewtonModel`; derivatives are finite differences."""
+    joints = q.shape[1]
     q = enforce_bounds(world, q)
-    places = q[:, None] + PROBE * jnp.eye(joints + 1, joints, -1)
-
-    def image(q):
-        return weighted_image(
-            world.chain, policy.splats, policy.cameras, policy.goal, q, policy.windows
-        )
-
-    images = map_lanes(image, places.reshape(-1, joints)).reshape(len(q), joints + 1, -1)
-    residual = images[:, 0] - weighted_goal(policy.goal)
-    jacobian = (images[:, 1:] - images[:, :1]) / PROBE
-    away = difference(world, closer.q_start, q)
+    # Predictions of every configuration, and of the same with each joint moved a little.
+    places = q[:, None] + FD_STEP * jnp.eye(joints + 1, joints, -1)
+    seen = map_lanes(lambda q: goal.goal.prediction(world, q), places.reshape(-1, joints))
+    seen = seen.reshape(len(q), joints + 1, -1)
+    residual = seen[:, 0] - goal.goal.target()
+    jacobian = (seen[:, 1:] - seen[:, :1]) / FD_STEP
+    away = difference(world, goal.q_start, q)
     loss = jnp.sum(residual**2, axis=1)
     return (
         q,
         loss,
-        loss + closer.prior * jnp.sum(away**2, axis=1),
-        jnp.einsum("nip,njp->nij", jacobian, jacobian) + closer.prior * jnp.eye(joints),
-        jnp.einsum("nip,np->ni", jacobian, residual) + closer.prior * away,
-        jax.vmap(is_free, (None, 0))(world, q),
+        loss + goal.prior * jnp.sum(away**2, axis=1),
+        jnp.einsum("nip,njp->nij", jacobian, jacobian) + goal.prior * jnp.eye(joints),
+        jnp.einsum("nip,np->ni", jacobian, residual) + goal.prior * away,
+        jax.vmap(world.is_free)(q),
     )

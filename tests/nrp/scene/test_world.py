@@ -15,7 +15,7 @@ from nrp_jax.homes.grid import coarsened, load_map
 from nrp_jax.scene.exact import ExactScene, merge_cells
 from nrp_jax.scene.field import clearance_bound, make_field
 from nrp_jax.scene.world import CarWorld
-from vrrt_jax.core.edges import free_steps
+from vrrt_jax.core.edges import free_prefix
 from vrrt_jax.core.planners.rrt import sample_configurations
 
 MAPS = Path(os.environ.get("NRP_MAPS", "maps-are-elsewhere"))
@@ -188,7 +188,9 @@ def test_free_steps_against_single_checks(worlds):
     q = sample_configurations(world, jax.random.key(5), 400)
     q = q[np.asarray(nrp_jax.batch_is_free(world, q))][:16]
     q_from, q_to = q[:8], q[8:16]
-    passed = np.asarray(jax.jit(free_steps, static_argnums=3)(world, q_from, q_to, 64))
+    passed = np.asarray(
+        jax.jit(free_prefix, static_argnums=3)(world, q_from, world.edge(q_from, q_to), 64)
+    )
     for a, b, count in zip(q_from, q_to, passed, strict=True):
         points = world.interpolate(a[None], b[None], jnp.arange(1, 65) / 64)
         free = np.asarray(nrp_jax.batch_is_free(world, points))
@@ -379,6 +381,7 @@ def test_a_subclass_is_obeyed_by_every_function(worlds, rng, name, kind):
     assert not bool(nrp_jax.is_free(zone, jnp.asarray(q[np.argmax(before & ~outside)])))
     # The kernel stops at the zone, and so do its edges.
     start, inside = q[np.argmax(expected)][None], q[np.argmax(before & ~outside)][None]
-    steps = int(free_steps(zone, jnp.asarray(start), jnp.asarray(inside), 64)[0])
+    start, inside = jnp.asarray(start), jnp.asarray(inside)
+    steps = int(free_prefix(zone, start, zone.edge(start, inside), 64)[0])
     assert steps < 64
     assert isinstance(nrp_jax.with_grid(zone, grid), kind)

@@ -11,7 +11,7 @@ import optax
 import pytest
 
 import vrrt_jax
-from vrrt_jax.bench import methods, protocol, runner, tables, tasks, twins, worlds
+from vrrt_jax.bench import methods, pose_ambiguity, protocol, runner, tables, tasks, worlds
 from vrrt_jax.cli import main
 from vrrt_jax.core.edges import joint_error
 from vrrt_jax.scene.obstacles import load_obstacles
@@ -80,14 +80,16 @@ def test_psnr_is_highest_at_the_goal(near_task):
 
 
 def test_twins_look_alike(near_task, tmp_path, monkeypatch, capsys):
-    q = twins.twin("panda", near_task).q_goal
+    q = pose_ambiguity.twin("panda", near_task).q_goal
     assert abs(q[-1] - near_task.q_goal[-1]) == pytest.approx(np.pi, abs=1e-5)
     np.testing.assert_array_equal(q[:-1], near_task.q_goal[:-1])
-    assert not twins._is_nearer("panda", near_task)  # the goal is half a radian from the start
+    assert not pose_ambiguity._is_nearer(
+        "panda", near_task
+    )  # the goal is half a radian from the start
 
-    monkeypatch.setattr(twins, "ROBOTS", ("ur5e",))
-    monkeypatch.setattr(twins, "LEVELS", (2.5,))
-    monkeypatch.setattr(twins, "LOOKED_AT", 1)
+    monkeypatch.setattr(pose_ambiguity, "ROBOTS", ("ur5e",))
+    monkeypatch.setattr(pose_ambiguity, "LEVELS", (2.5,))
+    monkeypatch.setattr(pose_ambiguity, "LOOKED_AT", 1)
     figure = tmp_path / "twins.png"
     assert main(["bench", "twins", "--tasks-per-level", "9", "--figure", str(figure)]) == 0
     (level,) = json.loads(capsys.readouterr().out)["ur5e"]

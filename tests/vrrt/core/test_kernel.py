@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import vrrt_jax
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import difference, free_steps, normalize, steer
+from vrrt_jax.core.edges import difference, free_prefix, normalize, steer
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.planners.rrt import RRT, tree_path
 from vrrt_jax.core.planners.rrt_connect import RRTConnect, connection_path
@@ -151,9 +151,9 @@ def test_free_steps_counts_the_leading_free_ones(wall_world, free):
     points = START + np.linspace(0, 1, 65)[1:, None] * (GOAL - START)
     is_free = np.asarray(free(wall_world, points.astype(np.float32)))
     assert not is_free.all() and is_free[0]
-    count = jax.jit(free_steps, static_argnums=3)(
-        wall_world, jnp.asarray(START)[None], jnp.asarray(GOAL)[None], 64
-    )
+    start, goal = jnp.asarray(START)[None], jnp.asarray(GOAL)[None]
+    edge = wall_world.edge(start, goal)
+    count = jax.jit(free_prefix, static_argnums=3)(wall_world, start, edge, 64)
     assert int(count[0]) == int(np.argmin(is_free))
 
 

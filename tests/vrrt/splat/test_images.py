@@ -25,7 +25,7 @@ def image():
 def test_goal_is_shrunk_by_area_with_its_camera(camera, image):
     goal, cameras = prepare_goal([image], [camera], 20)
     assert goal.rgb.shape == (1, 20, 27, 3), "80 / 3 rounds up"
-    assert float(goal.coverage.sum()) == pytest.approx(400 / 9, rel=1e-5)
+    assert float(goal.alpha.sum()) == pytest.approx(400 / 9, rel=1e-5)
     assert np.all(goal.valid[0, :, :26] == 1) and np.all(goal.valid[0, :, 26] == 0)
     point = jnp.array([0.1, 0.2, 0.5])
     (pixel, depth), (small, depth_small) = project(camera, point), project(shrunk(camera, 3), point)
@@ -37,7 +37,7 @@ def test_goal_is_shrunk_by_area_with_its_camera(camera, image):
 def test_plain_background_becomes_a_mask(camera, image):
     flat = image[..., :3] * image[..., 3:] + 0.5 * (1 - image[..., 3:])
     goal, _ = prepare_goal([np.round(255 * flat).astype(np.uint8)], [camera], 60)
-    np.testing.assert_allclose(goal.coverage[0], image[..., 3])
+    np.testing.assert_allclose(goal.alpha[0], image[..., 3])
     np.testing.assert_allclose(goal.rgb[0], image[..., :3], atol=3e-3)
 
 
@@ -45,7 +45,7 @@ def test_an_opaque_fourth_channel_is_no_mask(camera, image):
     flat = image[..., :3] * image[..., 3:] + 0.5 * (1 - image[..., 3:])
     opaque = np.concatenate([flat, np.ones((60, 80, 1))], axis=-1)
     goal, _ = prepare_goal([opaque], [camera], 60)
-    np.testing.assert_allclose(goal.coverage[0], image[..., 3])
+    np.testing.assert_allclose(goal.alpha[0], image[..., 3])
 
 
 def test_a_mask_of_bytes_is_one_of_truths(camera, image):
@@ -69,8 +69,8 @@ def test_scattered_holes_leave_the_rest(camera, image, rng):
     goal, _ = prepare_goal([holed], [camera], 15, [mask])
     kept = np.asarray(goal.valid[0]) > 0
     assert kept.mean() > 0.8 and float(goal.valid[0][kept].min()) >= 0.75
-    inside = kept & (np.asarray(whole.coverage[0]) == 1.0)
-    np.testing.assert_allclose(goal.coverage[0][inside], 1.0, atol=1e-6)
+    inside = kept & (np.asarray(whole.alpha[0]) == 1.0)
+    np.testing.assert_allclose(goal.alpha[0][inside], 1.0, atol=1e-6)
     np.testing.assert_allclose(goal.rgb[0][inside], whole.rgb[0][inside], atol=0.05)
 
 
@@ -162,14 +162,14 @@ def test_a_part_of_a_goal_is_what_its_camera_sees(camera, image):
     part, of_part = cut_goal(goal, cameras, np.array([[33.0, 30.0], [79.0, 2.0]]), 24)
     assert part.rgb.shape == (2, 24, 24, 3) and (of_part.height, of_part.width) == (24, 24)
     np.testing.assert_array_equal(part.rgb[0], goal.rgb[0, 18:42, 21:45])
-    np.testing.assert_array_equal(part.coverage[1], goal.coverage[1, :24, 56:])  # moved inwards
+    np.testing.assert_array_equal(part.alpha[1], goal.alpha[1, :24, 56:])  # moved inwards
     point = jnp.array([0.1, 0.2, 0.5])
     first = jax.tree.map(lambda leaf: leaf[0], of_part)
     np.testing.assert_allclose(
         project(first, point)[0], project(camera, point)[0] - jnp.array([21, 18]), rtol=1e-5
     )
     whole, _ = cut_goal(goal, cameras, np.array([[0.0, 0.0], [0.0, 0.0]]), 500)
-    assert whole.coverage.shape == (2, 60, 80)
+    assert whole.alpha.shape == (2, 60, 80)
 
 
 def test_levels_serve_about_their_size(panda):

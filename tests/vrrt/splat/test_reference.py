@@ -6,47 +6,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference.splats import painted, render_gaussians
+from splat_cases import IDENTITY, camera_ahead, render_jit, slopes, splats
 
 from vrrt_jax.bench.raster import random_splats
 from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.splat.camera import look_at
-from vrrt_jax.splat.raster import PIXEL_BLUR, render
-from vrrt_jax.splat.reference import Gaussians, composite, render_gaussians, render_reference
+from vrrt_jax.splat.projection import PIXEL_BLUR
+from vrrt_jax.splat.reference import composite, render_reference
 from vrrt_jax.splat.types import SplatModel
 
-COVERAGE_TOLERANCE = 1e-5  # worst seen 3e-6
+ALPHA_TOLERANCE = 1e-5  # worst seen 3e-6
 DIFFERENCE_TOLERANCE = 1e-6  # relative, of float64 gradients; worst seen 1e-8
 
-
-def ahead(height=48, width=40):
-    """A camera at the origin that looks along x; y points left and z up in the image."""
-    return look_at((0, 0, 0), (1, 0, 0), height=height, width=width)
-
-
-def gaussians(rng, num=6):
-    """Anisotropic splats between 1 and 2 m ahead."""
-    return Gaussians(
-        mean=jnp.asarray(rng.uniform((1, -0.3, -0.3), (2, 0.3, 0.3), (num, 3))),
-        quaternion=jnp.asarray(rng.normal(size=(num, 4))),
-        scale=jnp.asarray(rng.uniform(0.02, 0.12, (num, 3))),
-        density=jnp.asarray(rng.uniform(0.5, 3, num)),
-        rgb=jnp.asarray(rng.uniform(size=(num, 3))),
-    )
-
-
-def painted(pixel, covariance, depth, density, rgb, size):
-    """Front to back, pixel by pixel."""
-    image, coverage = np.zeros((*size, 3)), np.zeros(size)
-    for row, column in np.ndindex(size):
-        light = 1.0
-        for g in np.argsort(depth):
-            offset = np.array([column, row]) + 0.5 - pixel[g]
-            footprint = np.exp(-0.5 * offset @ np.linalg.inv(covariance[g]) @ offset)
-            alpha = 1.0 - np.exp(-density[g] * footprint)
-            image[row, column] += light * alpha * rgb[g]
-            light *= 1.0 - alpha
-        coverage[row, column] = 1.0 - light
-    return image, coverage
+reference_jit = jax.jit(render_reference)
 
 
 def test_composite_is_the_painters_loop(rng):
@@ -59,28 +32,30 @@ def test_composite_is_the_painters_loop(rng):
         rng.uniform(size=(7, 3)),
     )
     expected = painted(*arrays, (8, 10))
-    actual = composite(*(jnp.asarray(a, jnp.float32) for a in arrays), (8, 10))
+    draw = jax.jit(composite, static_argnums=5)
+    actual = draw(*(jnp.asarray(a, jnp.float32) for a in arrays), (8, 10))
     for a, b in zip(actual, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
 
 
 def test_a_long_gaussian_has_the_moments_of_its_projection():
     """0.2 m along the camera's x, 0.05 m along its y, then turned by a quarter about its axis."""
-    camera = ahead(80, 80)
+    camera = camera_ahead(80, 80)
     y, x = np.mgrid[:80, :80] + 0.5 - 40
     for quaternion, (along_x, along_y) in (
         ([1, 0, 0, 0], (0.2, 0.05)),
         ([2, 2, 0, 0], (0.05, 0.2)),  # about the world's x, where the camera looks
     ):
-        one = Gaussians(
-            mean=jnp.array([[2.0, 0.0, 0.0]]),
-            quaternion=jnp.array([quaternion], jnp.float32),
-            scale=jnp.array([[0.4, 0.2, 0.05]]),
-            density=jnp.array([1e-3]),
-            rgb=jnp.ones((1, 3)),
+        _, alpha = render_gaussians(
+            mean=np.array([[2.0, 0.0, 0.0]]),
+            quaternion=np.array([quaternion]),
+            scale=np.array([[0.4, 0.2, 0.05]]),
+            density=np.array([1e-3]),
+            rgb=np.ones((1, 3)),
+            camera=camera,
+            blur=PIXEL_BLUR,
         )
-        coverage = np.asarray(jax.jit(render_gaussians)(one, camera)[1], np.float64)
-        share = coverage / coverage.sum()
+        share = alpha / alpha.sum()
         focal = float(camera.focal)
         for offset, scale in ((x, along_x), (y, along_y)):
             expected = (focal * scale / 2.0) ** 2 + PIXEL_BLUR**2
@@ -88,84 +63,84 @@ def test_a_long_gaussian_has_the_moments_of_its_projection():
 
 
 def test_balls_are_the_same_as_isotropic_splats_on_the_optical_axis():
-    mean = jnp.array([[1.2, 0.0, 0.0], [1.6, 0.0, 0.0]])
-    balls = Gaussians(
-        mean=mean,
-        quaternion=jnp.array([[0.3, -0.4, 0.5, 0.6], [1.0, 0.0, 2.0, 0.0]]),
-        scale=jnp.broadcast_to(jnp.array([[0.05], [0.09]]), (2, 3)),
-        density=jnp.array([0.7, 2.0]),
-        rgb=jnp.array([[1.0, 0.2, 0.0], [0.0, 0.5, 1.0]]),
+    model = splats(
+        [[1.2, 0.0, 0.0], [1.6, 0.0, 0.0]],
+        [[1.0, 0.2, 0.0], [0.0, 0.5, 1.0]],
+        radius=(0.05, 0.09),
+        density=(0.7, 2.0),
+        shade=0,
     )
-    model = SplatModel(
-        mean=mean,
-        radius=balls.scale[:, 0],
-        density=balls.density,
-        rgb=balls.rgb,
-        view_color_gradient=jnp.zeros((2, 3)),
-        link=jnp.zeros(2, jnp.int32),
-        tau=jnp.float32(0.03),
+    balls = render_gaussians(
+        mean=np.asarray(model.mean, float),
+        quaternion=np.array([[0.3, -0.4, 0.5, 0.6], [1.0, 0.0, 2.0, 0.0]]),
+        scale=np.repeat(np.asarray(model.radius, float)[:, None], 3, axis=1),
+        density=np.asarray(model.density, float),
+        rgb=np.asarray(model.rgb, float),
+        camera=camera_ahead(),
+        blur=PIXEL_BLUR,
     )
-    for a, b in zip(
-        jax.jit(render_gaussians)(balls, ahead()),
-        jax.jit(render_reference)(model, jnp.eye(4)[None], ahead()),
-        strict=True,
-    ):
+    for a, b in zip(reference_jit(model, IDENTITY, camera_ahead()), balls, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
 
 
 @pytest.mark.parametrize("size", [(8, 8), (10, 12)])
 def test_gradients_are_those_of_finite_differences(rng, size):
+    """By all that a splat has, six of them between 1 and 2 m ahead."""
     with jax.enable_x64(True):
         weight = jnp.asarray(rng.normal(size=(*size, 4)))
+        model = splats(
+            rng.uniform((1, -0.3, -0.3), (2, 0.3, 0.3), (6, 3)),
+            rng.uniform(size=(6, 3)),
+            radius=rng.uniform(0.02, 0.12, 6),
+            density=rng.uniform(0.5, 3, 6),
+        )
 
-        @jax.jit
         def loss(x):
-            rgb, coverage = render_gaussians(x, ahead(*size))
-            return jnp.sum(weight * jnp.concatenate([rgb, coverage[..., None]], axis=-1))
+            rgb, alpha = render_reference(
+                dataclasses.replace(model, **x), IDENTITY, camera_ahead(*size)
+            )
+            return jnp.sum(weight * jnp.concatenate([rgb, alpha[..., None]], axis=-1))
 
-        x = gaussians(rng)
-        gradient = jax.jit(jax.grad(loss))(x)
-        for field in dataclasses.fields(x):
-            value = getattr(x, field.name)
-            direction = jnp.asarray(rng.normal(size=value.shape))
-            high, low = (
-                loss(dataclasses.replace(x, **{field.name: value + step * direction}))
-                for step in (1e-6, -1e-6)
-            )
-            slope = jnp.sum(getattr(gradient, field.name) * direction)
+        names = ("mean", "radius", "density", "rgb", "view_color_gradient")
+        x = {name: getattr(model, name) for name in names}
+        for name, difference, slope in slopes(loss, x, rng):
             np.testing.assert_allclose(
-                (high - low) / 2e-6, slope, rtol=DIFFERENCE_TOLERANCE, atol=1e-8
+                difference, slope, rtol=DIFFERENCE_TOLERANCE, atol=1e-8, err_msg=name
             )
+
+
+@jax.jit
+@jax.value_and_grad
+def brightness(x):
+    """Of an image of one splat, by what ``x`` holds."""
+    model = dataclasses.replace(splats(jnp.zeros((1, 3))), **x)
+    rgb, alpha = render_reference(model, IDENTITY, camera_ahead())
+    return jnp.sum(rgb) + jnp.sum(alpha)
 
 
 @pytest.mark.parametrize("mean", [[-1.0, 0.0, 0.0], [0.0, 0.1, 0.0], [1.0, 30.0, 0.0]])
-def test_a_gaussian_out_of_view_leaves_a_black_image_and_no_gradient(rng, mean):
-    one = jax.tree.map(lambda a: a[:1], gaussians(rng))
-    one = dataclasses.replace(one, mean=jnp.array([mean]))
-
-    @jax.jit
-    @jax.value_and_grad
-    def loss(x):
-        rgb, coverage = render_gaussians(x, ahead())
-        return jnp.sum(rgb) + jnp.sum(coverage)
-
-    value, gradient = loss(one)
+def test_a_splat_out_of_view_leaves_a_black_image_and_no_gradient(rng, mean):
+    model = splats([mean], rng.uniform(size=(1, 3)), radius=0.1)
+    names = ("mean", "radius", "density", "rgb", "view_color_gradient")
+    value, gradient = brightness({name: getattr(model, name) for name in names})
     assert value == 0.0
     for leaf in jax.tree.leaves(gradient):
         np.testing.assert_array_equal(leaf, 0.0)
 
 
-def test_the_fast_rasterizer_has_the_same_coverage(panda, rng):
+def test_the_fast_rasterizer_has_the_same_alpha(panda, rng):
     """1 - prod(1 - alpha) = 1 - exp(-sum), also where splats overlap."""
     model = random_splats(panda, 200, rng)
     camera = look_at((1.5, 1.2, 0.9), (0, 0, 0.4), height=40, width=48)
-    poses = link_poses(panda.chain, jnp.asarray(rng.uniform(panda.lower, panda.upper), jnp.float32))
-    fast, exact = (jax.jit(f)(model, poses, camera)[1] for f in (render, render_reference))
+    poses = jax.jit(link_poses)(
+        panda.chain, jnp.asarray(rng.uniform(panda.lower, panda.upper), jnp.float32)
+    )
+    fast, exact = (draw(model, poses, camera)[1] for draw in (render_jit, reference_jit))
     assert exact.max() > 0.9
-    np.testing.assert_allclose(fast, exact, atol=COVERAGE_TOLERANCE)
+    np.testing.assert_allclose(fast, exact, atol=ALPHA_TOLERANCE)
 
 
-def test_the_fast_rasterizer_has_the_same_colours_where_splats_do_not_overlap():
+def test_the_fast_rasterizer_has_the_same_colors_where_splats_do_not_overlap():
     """Shaded splats on two turned links, each in its own corner."""
     quarter = jnp.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     poses = jnp.stack([jnp.eye(4), jnp.eye(4).at[:3, :3].set(quarter)])
@@ -180,32 +155,29 @@ def test_the_fast_rasterizer_has_the_same_colours_where_splats_do_not_overlap():
         link=jnp.array([0, 0, 1, 1]),
         tau=jnp.float32(0.03),
     )
-    fast, _ = jax.jit(render)(model, poses, ahead(60, 60))
-    exact, coverage = jax.jit(render_reference)(model, poses, ahead(60, 60))
+    fast, _ = render_jit(model, poses, camera_ahead(60, 60))
+    exact, alpha = reference_jit(model, poses, camera_ahead(60, 60))
     assert np.all(np.max(exact, axis=(0, 1)) > 0.3)
-    clear = np.asarray(coverage) > 0.05  # elsewhere, tails of different splats mix
+    clear = np.asarray(alpha) > 0.05  # elsewhere, tails of different splats mix
     np.testing.assert_allclose(fast[clear], exact[clear], atol=1e-4)
 
 
 def test_soft_occlusion_becomes_true_occlusion_of_dense_splats():
     """A dense splat hides one behind it, the more so the smaller tau is."""
-    model = SplatModel(
-        mean=jnp.array([[1.5, 0.0, 0.0], [1.4, 0.0, 0.0]]),
-        radius=jnp.array([0.1, 0.1]),
-        density=jnp.array([20.0, 20.0]),
-        rgb=jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
-        view_color_gradient=jnp.zeros((2, 3)),
-        link=jnp.zeros(2, jnp.int32),
-        tau=jnp.float32(0.03),
+    model = splats(
+        [[1.5, 0.0, 0.0], [1.4, 0.0, 0.0]],
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]],
+        radius=0.1,
+        density=20.0,
+        shade=0,
     )
-    poses, camera = jnp.eye(4)[None], ahead()
-    fast, exact = jax.jit(render), jax.jit(render_reference)
+    poses, camera = IDENTITY, camera_ahead()
     front = dataclasses.replace(model, density=jnp.array([0.0, 20.0]))
-    dense = np.asarray(exact(front, poses, camera)[1]) > 0.9999
+    dense = np.asarray(reference_jit(front, poses, camera)[1]) > 0.9999
     assert dense.sum() > 20
     errors = []
     for tau in (0.1, 0.03, 0.01):
         softer = dataclasses.replace(model, tau=jnp.float32(tau))
-        difference = fast(softer, poses, camera)[0] - exact(model, poses, camera)[0]
+        difference = render_jit(softer, poses, camera)[0] - reference_jit(model, poses, camera)[0]
         errors.append(np.abs(difference)[dense].max())
     assert errors[0] > errors[1] > errors[2] and errors[2] < 1e-3

@@ -17,7 +17,7 @@ import vrrt_jax
 from vrrt_jax import planner
 from vrrt_jax.core import search as searches
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import free_steps
+from vrrt_jax.core.edges import free_prefix
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.rewire import with_costs
 from vrrt_jax.core.tree import UNREACHED, lineage
@@ -47,9 +47,9 @@ def camera():
 def picture(panda, self_model, camera, q, level=1):
     splats = self_model.levels[level].splats
     poses = vrrt_jax.link_poses(panda.chain, jnp.asarray(q))
-    rgb, coverage = jax.jit(vrrt_jax.render)(splats, poses, camera)
-    straight = rgb / jnp.maximum(coverage, 1e-3)[..., None]
-    return np.clip(np.concatenate([straight, coverage[..., None]], axis=-1), 0, 1)
+    rgb, alpha = jax.jit(vrrt_jax.render)(splats, poses, camera)
+    straight = rgb / jnp.maximum(alpha, 1e-3)[..., None]
+    return np.clip(np.concatenate([straight, alpha[..., None]], axis=-1), 0, 1)
 
 
 @pytest.fixture(scope="module")
@@ -413,7 +413,11 @@ def beside(y):
 def test_a_straight_way_that_only_the_spheres_refuse(slider, margin, granted):
     world = vrrt_jax.build_world(slider, [beside(0.1525)], margin=margin)
     ends = np.array([[-0.5], [0.5]], np.float32)
-    steps = int(free_steps(world, jnp.asarray(ends[:1]), jnp.asarray(ends[1:]), 64)[0])
+    steps = int(
+        free_prefix(world, ends[:1], world.edge(jnp.asarray(ends[:1]), jnp.asarray(ends[1:])), 64)[
+            0
+        ]
+    )
     assert 0 < steps < 64
     found = finished(trees.create(jnp.asarray(ends), jnp.zeros(2), None, 8))
     _, way = finish._straight(slider, world, found, *ends)

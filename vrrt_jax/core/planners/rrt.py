@@ -1,12 +1,14 @@
-"""RRT and RRT* to a joint goal, as policies of the kernel."""
+"""RRT, with every sub-step as a node if asked for (RRT-IS)."""
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import Space, distance
-from vrrt_jax.core.rewire import rewire
+from vrrt_jax.core.edges import Space
+from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
 
 
@@ -19,60 +21,94 @@ def sample_configurations(world: Space, key: jax.Array, num: int) -> jax.Array:
 
 @pytree
 class RRT:
-    """Single-tree RRT (LaValle 1998); RRT* (Karaman and Frazzoli 2011) with a ``rewire_radius``.
+    """Single-tree RRT (LaValle 1998): extend the nearest node towards a random configuration.
 
     A node's score is its distance to the goal.
     """
 
-    goal: jax.Array  # (D,)
-    goal_bias: jax.Array  # () share of lanes that aim at the goal
-    rewire_radius: jax.Array  # () [rad], used if ``star``
-    star: bool = static(default=False)
+    goal_bias: Any = 0.1  # () share of lanes that aim at the goal
+    keep_partial: bool = static(default=False)  # keep the free part of a blocked edge
+    # Every sub-step of an edge becomes a node as well, without a score: RRT-IS (Lu et al. 2024).
+    intermediate: bool = static(default=False)
     lanes: int = static(default=32)
     edge_steps: int = static(default=32)
-    rewire_steps: int = static(default=96)  # longer than a step: near is far in seven dimensions
 
-    def root(self, world: Space, q: jax.Array) -> tuple[jax.Array, None]:
-        """Score of a root; there is no payload."""
-        return distance(world, q, self.goal), None
+    def init(self, world: Space, goal: ConfigurationGoal, q_roots: Any, capacity: int) -> Tree:
+        """A tree of the start, and a forest if there are other roots."""
+        q = jnp.asarray(q_roots)
+        score = jax.vmap(lambda q: goal.loss(world, q))(q)
+        return trees.create(q, score, None, capacity, trees.root_costs(len(q)))
 
-    def propose(self, world: Space, tree: Tree, key: jax.Array) -> Proposals:
+    def goal_score(self, goal: ConfigurationGoal) -> float:
+        """The goal's own threshold."""
+        return float(goal.threshold)
+
+    def propose(
+        self, world: Space, goal: ConfigurationGoal, tree: Tree, key: jax.Array
+    ) -> Proposals:
         """Extend the nearest nodes towards random configurations, or the goal."""
-        key_q, key_bias = jax.random.split(key)
-        target = sample_configurations(world, key_q, self.lanes)
-        aims = jax.random.uniform(key_bias, (self.lanes, 1)) < self.goal_bias
-        target = jnp.where(aims.at[0].set(tree.iteration == 0), self.goal, target)
-        parent = jnp.argmin(trees.distances(world, tree, target), axis=1)
-        everywhere = jnp.ones(self.lanes, bool)
+        parent, aim = self.sample_aims(world, goal, tree, key)
         return Proposals(
-            parent=parent.astype(jnp.int32),
-            target=target,
-            valid=everywhere,
-            partial=~everywhere,
+            parent=parent,
+            target=aim,
+            valid=jnp.ones(self.lanes, bool),
+            partial=jnp.full(self.lanes, self.keep_partial),
             aux=None,
         )
 
-    def evaluate(self, world: Space, q: jax.Array, proposals: Proposals):
-        """Distances (B,) to the goal."""
-        return distance(world, q, self.goal), None
+    def evaluate(self, world: Space, goal: ConfigurationGoal, q: jax.Array, proposals: Proposals):
+        """Distances (B,) to the goal; there is no payload."""
+        return jax.vmap(lambda q: goal.loss(world, q))(q), None
 
     def after_insert(
-        self, world: Space, tree: Tree, proposals: Proposals, expansion: Expansion
+        self,
+        world: Space,
+        goal: ConfigurationGoal,
+        tree: Tree,
+        proposals: Proposals,
+        expansion: Expansion,
     ) -> Tree:
-        """Rewire, if this is RRT*."""
-        if not self.star:
+        """Insert the sub-steps, if they are wanted."""
+        return self.with_sub_steps(world, tree, proposals.parent, expansion.q, expansion.accepted)
+
+    def extract_path(self, tree: Tree) -> np.ndarray | None:
+        """The path (P, D) to the node nearest to the goal."""
+        return trees.branch_path(tree)
+
+    def sample_aims(
+        self, world: Space, goal: ConfigurationGoal, tree: Tree, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Random configurations (B, D) or the goal, and the nodes (B,) nearest to them."""
+        key_q, key_bias = jax.random.split(key)
+        aim = sample_configurations(world, key_q, self.lanes)
+        at_goal = jax.random.uniform(key_bias, (self.lanes,)) < self.goal_bias
+        # The first lane of all tries the straight edge from the start to the goal.
+        at_goal = at_goal.at[0].set(at_goal[0] | (tree.iteration == 0))
+        aim = jnp.where(at_goal[:, None], goal.q, aim)
+        parent = jnp.argmin(trees.distances(world, tree, aim), axis=1)
+        return parent.astype(jnp.int32), aim
+
+    def with_sub_steps(
+        self, world: Space, tree: Tree, parent: jax.Array, q: jax.Array, valid: jax.Array
+    ) -> Tree:
+        """Insert the sub-steps between nodes (B,) and their children (B, D) as children too."""
+        if not self.intermediate:
             return tree
-        return rewire(
-            world,
+        q_from = tree.q[parent]
+        edge = world.edge(q_from, q)
+        # Sub-steps as long as the world's resolution; an edge has at most edge_steps of them.
+        num_sub_steps = jnp.maximum(world.span(edge) / world.resolution, 1.0)
+        step = jnp.arange(1, self.edge_steps, dtype=q.dtype)[:, None]
+        fraction = step / num_sub_steps  # (S - 1, B), 1 and more beyond the child
+        between = world.truncate(edge, jnp.minimum(fraction, 1.0))
+        points = world.normalize(world.end(q_from, between)).reshape(-1, q.shape[-1])
+        tree, _ = trees.insert(
             tree,
-            expansion,
-            radius=self.rewire_radius,
-            edge_steps=self.rewire_steps,
-            checks=self.lanes,
+            q=points,
+            parent=jnp.broadcast_to(parent, fraction.shape).reshape(-1),
+            cost=(tree.cost[parent] + world.length(between)).reshape(-1),
+            score=jnp.full(fraction.size, jnp.inf),
+            payload=None,
+            valid=(valid & (fraction < 1.0)).reshape(-1),
         )
-
-
-def tree_path(tree: Tree, index: int | None = None) -> np.ndarray:
-    """The path (P, D) from the root to a node, the one with the best score by default."""
-    index = int(np.argmin(tree.score)) if index is None else index
-    return np.asarray(tree.q)[trees.lineage(tree, index)]
+        return tree

@@ -1,6 +1,7 @@
 """RRT-Connect: two trees that grow towards each other."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import Space, distance
+from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
 
@@ -24,6 +26,16 @@ class ConnectNode:
 
 
 @pytree
+class ConnectLanes:
+    """What the lanes of an iteration are about."""
+
+    connects: jax.Array  # (B,) bool, drives a node towards the other tree
+    nearest: jax.Array  # (B,) i32 node that the lane's aim is nearest to
+    q_nearest: jax.Array  # (B, D)
+    side: jax.Array  # (B,) i32 tree that the child belongs to
+
+
+@pytree
 class RRTConnect:
     """RRT-Connect (Kuffner and LaValle 2000): two trees in one forest of two roots.
 
@@ -32,97 +44,114 @@ class RRTConnect:
     A node that arrives scores 0.
     """
 
-    margin: float = 1.0  # how far from the ends half of the samples are drawn [rad]
+    margin: Any = 1.0  # how far from the ends half of the samples are drawn [rad]
     lanes: int = static(default=32)
     edge_steps: int = static(default=32)
 
-    def forest(self, q_start: jax.Array, q_goal: jax.Array, capacity: int) -> Tree[ConnectNode]:
-        """The two trees before the first iteration."""
+    def init(
+        self, world: Space, goal: ConfigurationGoal, q_roots: Any, capacity: int
+    ) -> Tree[ConnectNode]:
+        """The start is node 0 and the goal node 1; other roots are not used."""
         ends = ConnectNode(
             side=jnp.array([0, 1], jnp.int32),
             fresh=jnp.array([True, True]),
             meets=jnp.array([-1, -1], jnp.int32),
         )
+        q = jnp.stack([jnp.asarray(q_roots)[0], jnp.asarray(goal.q)])
         far = jnp.full(2, jnp.finfo(jnp.float32).max)
-        return trees.create(jnp.stack([q_start, q_goal]), far, ends, capacity)
+        return trees.create(q, far, ends, capacity)
 
-    def propose(self, world: Space, tree: Tree[ConnectNode], key: jax.Array) -> Proposals:
+    def goal_score(self, goal: ConfigurationGoal) -> float:
+        """0, which only a node has where the trees meet."""
+        return 0.0
+
+    def propose(
+        self, world: Space, goal: ConfigurationGoal, tree: Tree[ConnectNode], key: jax.Array
+    ) -> Proposals:
         """Connect the newest fresh nodes; extend with all other lanes."""
         lane = jnp.arange(self.lanes)
         index = jnp.arange(tree.capacity)
         node = tree.payload
+
+        # The second half of the lanes connects: one fresh node each, the newest first.
         waiting = node.fresh & trees.occupied(tree)
         newest, chosen = jax.lax.top_k(jnp.where(waiting, index, -1), self.lanes // 2)
         half = self.lanes - self.lanes // 2
         connects = jnp.concatenate([jnp.zeros(half, bool), newest >= 0])
         chosen = jnp.concatenate([jnp.zeros(half, jnp.int32), chosen.astype(jnp.int32)])
 
-        # Half of the samples near the two ends: where limits are far apart, few others serve.
+        # The others extend towards samples. Half of the samples are near the two ends: where
+        # limits are far apart, few others serve.
         q_start, q_goal = tree.q[:2]
         ends = jnp.stack([q_start, world.end(q_start, world.edge(q_start, q_goal))])
         lower = jnp.maximum(world.lower, jnp.min(ends, axis=0) - self.margin)
         upper = jnp.minimum(world.upper, jnp.max(ends, axis=0) + self.margin)
         key_near, key_far = jax.random.split(key)
-        aim_shape = (self.lanes, lower.shape[0])
+        sample_shape = (self.lanes, lower.shape[0])
         sample = jnp.where(
             (lane // 2 % 2 == 0)[:, None],
-            jax.random.uniform(key_near, aim_shape, minval=lower, maxval=upper),
+            jax.random.uniform(key_near, sample_shape, minval=lower, maxval=upper),
             sample_configurations(world, key_far, self.lanes),
         )
+
+        # A connecting lane goes from its node to the nearest of the other tree, an extending lane
+        # from the nearest node of its own tree to its sample; these take turns between the trees.
         aim = jnp.where(connects[:, None], tree.q[chosen], sample)
         side = jnp.where(connects, 1 - node.side[chosen], lane % 2)
-        apart = trees.distances(world, tree, aim, among=node.side == side[:, None])
-        nearest = jnp.argmin(apart, axis=1).astype(jnp.int32)
+        distances = trees.distances(world, tree, aim, among=node.side == side[:, None])
+        nearest = jnp.argmin(distances, axis=1).astype(jnp.int32)
+        parent = jnp.where(connects, chosen, nearest)
         return Proposals(
-            parent=jnp.where(connects, chosen, nearest),
+            parent=parent,
             target=jnp.where(connects[:, None], tree.q[nearest], aim),
             valid=jnp.ones(self.lanes, bool),
             partial=jnp.ones(self.lanes, bool),
-            aux=(
-                connects,
-                nearest,
-                tree.q[nearest],
-                node.side[jnp.where(connects, chosen, nearest)],
+            aux=ConnectLanes(
+                connects=connects,
+                nearest=nearest,
+                q_nearest=tree.q[nearest],
+                side=node.side[parent],
             ),
         )
 
-    def evaluate(self, world: Space, q: jax.Array, proposals: Proposals):
-        """0 for children that arrived; the way left, or a large number, for the others."""
-        connects, nearest, target, side = proposals.aux
-        left = distance(world, q, target)
-        arrived = connects & (left < SAME)
-        score = jnp.where(connects, jnp.where(arrived, 0.0, left), 1e6)
+    def evaluate(self, world: Space, goal: ConfigurationGoal, q: jax.Array, proposals: Proposals):
+        """0 for children that arrived; the distance left, or a large number, for the others."""
+        lanes: ConnectLanes = proposals.aux
+        left = distance(world, q, lanes.q_nearest)
+        arrived = lanes.connects & (left < SAME)
+        score = jnp.where(lanes.connects, jnp.where(arrived, 0.0, left), 1e6)
         node = ConnectNode(
-            side=side.astype(jnp.int32),
+            side=lanes.side.astype(jnp.int32),
             fresh=~arrived,
-            meets=jnp.where(arrived, nearest, -1).astype(jnp.int32),
+            meets=jnp.where(arrived, lanes.nearest, -1).astype(jnp.int32),
         )
         return score, node
 
     def after_insert(
         self,
         world: Space,
+        goal: ConfigurationGoal,
         tree: Tree[ConnectNode],
         proposals: Proposals,
         expansion: Expansion,
     ) -> Tree[ConnectNode]:
         """A node has had its try; a child that ran into something while connecting has too."""
-        connects = proposals.aux[0]
+        connects = proposals.aux.connects
+        # Writes to slot N are dropped: lanes that extend change nothing.
         tried = jnp.where(connects, proposals.parent, tree.capacity)
         stuck = jnp.where(connects & expansion.blocked, expansion.node_index, tree.capacity)
         fresh = tree.payload.fresh.at[tried].set(False, mode="drop")
         fresh = fresh.at[stuck].set(False, mode="drop")
         return dataclasses.replace(tree, payload=dataclasses.replace(tree.payload, fresh=fresh))
 
-
-def connection_path(tree: Tree[ConnectNode]) -> np.ndarray | None:
-    """The path (P, D) from start to goal through the place where the trees met, if they did."""
-    best = int(np.argmin(tree.score))
-    other = int(tree.payload.meets[best])
-    if other < 0:
-        return None
-    halves = [trees.lineage(tree, best), trees.lineage(tree, other)]
-    if int(tree.payload.side[best]) == 1:
-        halves.reverse()
-    q = np.asarray(tree.q)
-    return np.concatenate([q[halves[0]], q[halves[1][::-1]][1:]])
+    def extract_path(self, tree: Tree[ConnectNode]) -> np.ndarray | None:
+        """The path (P, D) from start to goal through the place where the trees met, if they did."""
+        best = int(np.argmin(tree.score))
+        other = int(tree.payload.meets[best])
+        if other < 0:
+            return None
+        halves = [trees.branch_path(tree, best), trees.branch_path(tree, other)]
+        if int(tree.payload.side[best]) == 1:
+            halves.reverse()
+        # Both nodes stand where the trees met: one of them is left out.
+        return np.concatenate([halves[0], halves[1][::-1][1:]])

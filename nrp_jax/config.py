@@ -1,0 +1,27 @@
+"""The settings of a plan in a home."""
+
+import dataclasses
+
+from vrrt_jax.core.settings import check_settings, setting
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlannerConfig:
+    """Settings of a plan. Lanes and capacity re-compile, the others are only new numbers."""
+
+    goal_bias: float = setting(0.3, 0.0, 1.0)  # share of expansions that aim at the goal
+    straight_rate: float = setting(0.2, 0.0, 1.0)  # share that goes straight, with a sampler
+    lanes: int = setting(32, 1, 4096)  # expansions at a time; rrt-connect takes two at least
+    capacity: int = setting(8192, 3)  # most nodes of the tree
+    max_expansions: int = setting(32_000, 1)  # budget; one iteration of all lanes is the least
+    time_limit_s: float = setting(60.0, 0.0)  # wall time of the search [s]
+
+
+def check_config(config: PlannerConfig) -> None:
+    """Raise a ValueError that names the setting out of range."""
+    check_settings(config)
+    if config.capacity < config.lanes + 2:
+        raise ValueError(
+            f"capacity is {config.capacity}; expected at least {config.lanes + 2}, two more than "
+            "the lanes: raise it or lower lanes"
+        )

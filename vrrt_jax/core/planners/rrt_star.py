@@ -1,0 +1,42 @@
+"""RRT*: RRT whose tree is rewired, so that paths get shorter as long as it runs."""
+
+from typing import Any
+
+import jax
+
+from vrrt_jax.core.edges import Space
+from vrrt_jax.core.goal import ConfigurationGoal
+from vrrt_jax.core.planners.rrt import RRT
+from vrrt_jax.core.rewire import rewire
+from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
+
+
+@pytree
+class RRTStar(RRT):
+    """RRT* (Karaman and Frazzoli 2011). It goes on to improve until its budget ends."""
+
+    # Nodes of a sparse tree in seven dimensions lie that far apart.
+    rewire_radius: Any = 1.9  # () [rad]
+    rewire_steps: int = static(default=96)  # sub-steps of an edge that rewiring checks
+
+    def goal_score(self, goal: ConfigurationGoal) -> float:
+        """None: a path can always be shorter."""
+        return -float("inf")
+
+    def after_insert(
+        self,
+        world: Space,
+        goal: ConfigurationGoal,
+        tree: Tree,
+        proposals: Proposals,
+        expansion: Expansion,
+    ) -> Tree:
+        """Rewire."""
+        return rewire(
+            world,
+            tree,
+            expansion,
+            radius=jax.numpy.float32(self.rewire_radius),
+            edge_steps=self.rewire_steps,
+            checks=self.lanes,
+        )

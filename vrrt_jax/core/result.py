@@ -1,0 +1,106 @@
+"""What becomes of a plan: one status and one result for all planners and goals."""
+
+import dataclasses
+import enum
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from vrrt_jax.core.search import SearchResult, StopReason
+from vrrt_jax.core.types import Rejection, Tree
+
+
+class Status(enum.Enum):
+    """How a plan ended."""
+
+    SOLVED = "a collision-free path to the goal, checked with C MuJoCo"
+    NO_MATCH = "no configuration was found that meets the goal"
+    NO_PATH = "the goal was met, but no path to it was found"
+    MAX_ITERATIONS = "the iterations ran out"
+    TREE_FULL = "the tree is full"
+    TIME_LIMIT = "the time limit passed"
+    INTERRUPTED = "interrupted; the best path so far is returned"
+    NOT_VERIFIED = "the path touches something under the exact check"
+
+
+STATUS_OF = {
+    StopReason.CONVERGED: Status.NO_MATCH,
+    StopReason.ITERATIONS: Status.MAX_ITERATIONS,
+    StopReason.TREE_FULL: Status.TREE_FULL,
+    StopReason.TIME_LIMIT: Status.TIME_LIMIT,
+    StopReason.INTERRUPTED: Status.INTERRUPTED,
+}
+EARLY_STOPS = (StopReason.TIME_LIMIT, StopReason.INTERRUPTED)  # what ends a search, ends the plan
+ABORTED = tuple(STATUS_OF[stopped] for stopped in EARLY_STOPS)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Verification:
+    """What the exact check with C MuJoCo found."""
+
+    ok: bool  # inside the limits and free all the way
+    checked: int  # number of configurations checked
+    contact: str | None  # the first violation, such as "link5 touches box_2 at 37 % of the path"
+    clearance: float = float("nan")  # smallest distance to obstacles, where it is measured [m]
+    geometry: str = "primitives"  # what the robot was made of, or "meshes", or "spheres"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanResult:
+    """What became of a problem. Letters: ``P`` waypoints, ``D`` joints, ``A`` alternatives."""
+
+    status: Status
+    advice: str  # what to try next; "" if solved
+    # (P, D) waypoints of the shortened, verified path; of a failure, the best attempt. Joints
+    # without limits may leave [-pi, pi), so that waypoints can be interpolated.
+    path: np.ndarray
+    trajectory: np.ndarray  # (T, D) the same path in the small steps that were verified
+    raw_path: np.ndarray  # (P', D) as the tree has it
+    target: np.ndarray  # (D,) what was planned to: the end of the path, unless there is none
+    alternatives: np.ndarray  # (A, D) other configurations that meet the goal as well
+    loss: float  # of the target: image loss, or distance to a joint goal [rad]
+    match_threshold: float  # at or below which the loss counts as matched
+    search_match_threshold: float  # the same in the search, which may use smaller images
+    cost: float  # length of ``path`` in the world's metric [rad] or [m]
+    verification: Verification | None  # None if there was no path to verify
+    rejected: Mapping[str, int]  # lanes lost, by reason
+    iterations: int
+    expansions: int  # lanes tried
+    timing: Mapping[str, float]  # compile_s, search_s, shortcut_s, verify_s
+    history: np.ndarray  # (chunks + 1, 4): iteration, seconds, best score, nodes
+    tree: Tree
+
+    @property
+    def ok(self) -> bool:
+        """Solved: matched, collision-free and verified."""
+        return self.status is Status.SOLVED
+
+    @property
+    def q_goal(self) -> np.ndarray:
+        """(D,) the end of the path."""
+        return self.path[-1]
+
+    def __str__(self) -> str:
+        """One line for people."""
+        times = ", ".join(f"{k.removesuffix('_s')} {v:.1f} s" for k, v in self.timing.items())
+        others = len(self.alternatives)
+        ambiguous = f"; ambiguous: {others} other configurations look the same" if others else ""
+        return (
+            f"{self.status.name}: loss {self.loss:.2e} (goal {self.match_threshold:.2e}), "
+            f"{len(self.path)} waypoints, cost {self.cost:.2f}, {self.iterations} iterations; "
+            f"{times}{ambiguous}"
+        )
+
+
+def rejected_lanes(found: SearchResult) -> dict[str, int]:
+    """Lanes lost in a search, by reason."""
+    rejected = np.asarray(found.tree.rejected)
+    return {reason.name.lower(): int(rejected[reason]) for reason in Rejection}
+
+
+def with_time_of(result: PlanResult, *results: PlanResult) -> PlanResult:
+    """A result that took the time, and the expansions, of all."""
+    timing: dict[str, Any] = {name: sum(r.timing[name] for r in results) for name in result.timing}
+    expansions = sum(r.expansions for r in results)
+    return dataclasses.replace(result, timing=timing, expansions=expansions)

@@ -1,0 +1,163 @@
+"""Train the splats of one level of detail on images, with a checkpoint every 50 steps."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from tqdm import tqdm
+
+from vrrt_jax.core.files import replacing
+from vrrt_jax.robots.kinematics import link_poses
+from vrrt_jax.splat.fit_config import LevelConfig
+from vrrt_jax.splat.initial_splats import initial_splats
+from vrrt_jax.splat.loss import image_loss, psnr_db
+from vrrt_jax.splat.model import Level
+from vrrt_jax.splat.raster import render
+from vrrt_jax.splat.training_images import TrainingImages, shrink
+from vrrt_jax.splat.types import SplatModel
+
+CHECKPOINT_STEPS = 50
+TRAINED = ("mean", "radius", "density", "rgb", "view_color_gradient", "tau")
+MIN_TAU = 0.03  # [m] the softness of occlusion stays above this
+
+
+def fit_level(
+    robot,
+    train: TrainingImages,
+    held_out: TrainingImages,
+    points: np.ndarray,
+    level: LevelConfig,
+    *,
+    learning_rate: float,
+    seed: int,
+    file: Path,
+) -> Level:
+    """Train the splats of one level of detail.
+
+    Args:
+        robot: from :func:`vrrt_jax.load_robot`.
+        train: images to train with.
+        held_out: images to validate with.
+        points: (m, 7) surface points that the splats start from.
+        level: number of splats and steps, size of the images.
+        learning_rate: of the first step.
+        seed: of the start and the order of the images.
+        file: the checkpoint. A training that was interrupted goes on from it.
+    """
+    train, held_out = shrink(train, level.size_px), shrink(held_out, level.size_px)
+    start = initial_splats(points, level.num_splats, seed)
+    change = {name: jnp.zeros_like(getattr(start, name)) for name in TRAINED}
+    schedule = optax.cosine_decay_schedule(learning_rate, level.steps, 0.02)
+    optimizer = optax.adam(schedule, b1=0.9, b2=0.99)
+    state = optimizer.init(change)
+    step = _training_step(robot, start, optimizer, level.batch)
+
+    # Each step takes the first images of an order of its own, which does not depend on where the
+    # training was interrupted.
+    rng = np.random.default_rng(seed)
+    order = rng.permuted(np.tile(np.arange(len(train.q)), (level.steps, 1)), axis=1)
+    first = 0
+    if file.exists():
+        change, state, first = restore_checkpoint(file, change, state)
+    progress = tqdm(
+        range(first, level.steps),
+        desc=f"{level.num_splats} splats, {level.size_px} px",
+        initial=first,
+        total=level.steps,
+        unit="step",
+    )
+    for i in progress:
+        change, state, value = step(change, state, *_batch(train, order[i, : level.batch]))
+        if (i + 1) % CHECKPOINT_STEPS == 0:
+            progress.set_postfix_str(f"{psnr_db(float(value)):.1f} dB")
+            _store_checkpoint(file, change, state, i + 1)
+
+    splats = jax.tree.map(jax.lax.stop_gradient, _assemble(start, change))
+    losses, covered = _validate(robot, splats, held_out)
+    return Level(
+        splats=splats,
+        size_px=level.size_px,
+        psnr_db=round(psnr_db(float(losses.mean())), 2),
+        match_threshold=float(f"{np.quantile(losses / covered, 0.95):.4g}"),
+    )
+
+
+def _assemble(start: SplatModel, change: dict[str, jax.Array]) -> SplatModel:
+    """Splats from unconstrained changes, scaled so that one learning rate suits all."""
+    return dataclasses.replace(
+        start,
+        mean=start.mean + 0.02 * change["mean"],
+        radius=start.radius * jnp.exp(0.5 * change["radius"]),
+        density=start.density * jnp.exp(change["density"]),
+        rgb=start.rgb + 0.5 * change["rgb"],
+        view_color_gradient=start.view_color_gradient + 0.5 * change["view_color_gradient"],
+        tau=MIN_TAU + (start.tau - MIN_TAU) * jnp.exp(change["tau"]),
+    )
+
+
+def _training_step(
+    robot, start: SplatModel, optimizer: optax.GradientTransformation, num: int
+) -> Callable:
+    """A compiled step: changes, optimizer's state and a batch to new changes, state and loss."""
+
+    def loss(change, q, camera, rgb, alpha):
+        image = render(_assemble(start, change), link_poses(robot.chain, q), camera)
+        return image_loss(*image, rgb, alpha, jnp.ones_like(alpha))
+
+    @jax.jit
+    def step(change, state, *batch):
+        # One image after the other, with the memory of one.
+        def add(total, example):
+            value, gradient = jax.value_and_grad(loss)(change, *example)
+            return jax.tree.map(jnp.add, total, (value, gradient)), None
+
+        zero = (jnp.float32(0), jax.tree.map(jnp.zeros_like, change))
+        (value, gradient), _ = jax.lax.scan(add, zero, batch)
+        gradient = jax.tree.map(lambda g: g / num, gradient)
+        updates, state = optimizer.update(gradient, state)
+        return optax.apply_updates(change, updates), state, value / num
+
+    return step
+
+
+def _batch(images: TrainingImages, rows: np.ndarray) -> tuple[Any, ...]:
+    """Configurations, cameras, colors and alphas of some images."""
+    return (
+        jnp.asarray(images.q[rows], jnp.float32),
+        jax.tree.map(lambda leaf: leaf[rows], images.cameras),
+        jnp.asarray(images.rgb[rows]),
+        jnp.asarray(images.alpha[rows]),
+    )
+
+
+def _validate(robot, splats: SplatModel, images: TrainingImages) -> tuple[np.ndarray, np.ndarray]:
+    """Losses (n,) at the true poses, and covered shares (n,) of the images."""
+
+    @jax.jit
+    def loss(q, camera, rgb, alpha):
+        image = render(splats, link_poses(robot.chain, q), camera)
+        return image_loss(*image, rgb, alpha, jnp.ones_like(alpha))
+
+    losses = [float(loss(*_batch(images, i))) for i in range(len(images.q))]
+    covered = images.alpha.reshape(len(losses), -1).astype(np.float32).mean(axis=1)
+    return np.array(losses), np.maximum(covered, 1e-3)
+
+
+def _store_checkpoint(file: Path, change, state, steps: int) -> None:
+    leaves: list[Any] = [np.asarray(leaf) for leaf in jax.tree.leaves((change, state))]
+    with replacing(file) as handle:
+        np.savez(handle, steps=steps, **{f"leaf_{i}": leaf for i, leaf in enumerate(leaves)})
+
+
+def restore_checkpoint(file: Path, change, state):
+    """Changes, optimizer's state and number of steps done; the arguments give the structure."""
+    structure = jax.tree.structure((change, state))
+    with np.load(file) as saved:
+        leaves = [jnp.asarray(saved[f"leaf_{i}"]) for i in range(structure.num_leaves)]
+        change, state = jax.tree.unflatten(structure, leaves)
+        return change, state, int(saved["steps"])
