@@ -387,7 +387,7 @@ def test_a_subclass_is_obeyed_by_every_function(worlds, rng, name, kind):
     assert not bool(nrp_jax.is_free(zone, jnp.asarray(q[np.argmax(before & ~outside)])))
     # The kernel stops at the zone, and so do its edges.
     start, inside = q[np.argmax(expected)][None], q[np.argmax(before & ~outside)][None]
-    edge = zone.edge(jnp.asarray(start), jnp.asarray(inside))
-    steps = int(free_prefix(zone, jnp.asarray(start), edge, 64)[0])
+    start, inside = jnp.asarray(start), jnp.asarray(inside)
+    steps = int(free_prefix(zone, start, zone.edge(start, inside), 64)[0])
     assert steps < 64
     assert isinstance(nrp_jax.with_grid(zone, grid), kind)
