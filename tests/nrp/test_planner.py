@@ -124,8 +124,8 @@ def test_rrt_connect_counts_the_lanes_it_takes(solve, monkeypatch):
     class Asked(Exception):
         pass
 
-    def search(world, policy, tree, *, stop, **_):
-        raise Asked(policy.lanes, int(stop.max_iterations))
+    def search(world, goal, policy, tree, *, termination, **_):
+        raise Asked(policy.lanes, int(termination.max_iterations))
 
     monkeypatch.setattr(planner, "search", search)
     with pytest.raises(Asked) as asked:
@@ -207,13 +207,16 @@ def test_sideways_is_seen():
         ({"q_start": START + 50}, r"the start's x is 51.0; the map spans \[0.000, 5.000\]"),
         ({"q_goal": np.full(8, np.nan)}, "the goal's x is nan"),
         ({"q_goal": np.r_[2.5, 1.0, START[2:]]}, "the goal touches the map"),
-        ({"method": "prm"}, "unknown method 'prm'; have: rrt, rrt-is"),
+        ({"planner": "prm"}, "unknown planner 'prm'; have: rrt, rrt-is"),
+        ({"method": "prm"}, "unknown planner 'prm'; have: rrt, rrt-is"),
+        ({"planner": object()}, "the planner object lacks edge_steps, lanes, init"),
+        ({"max_iterations": 3}, "unknown settings max_iterations; have: goal_bias"),
         (
             {"method": "nrp-g", "sampler": nrp_jax.load_sampler("snake", "discriminator")},
             "the sampler is the discriminator of 'snake'; expected the cvae",
         ),
-        ({"goal_bias": 2.0}, "shares in"),
-        ({"max_expansions": 0}, "max_expansions 0; expected 1 or more"),
+        ({"goal_bias": 2.0}, r"goal_bias=2.0 is out of range; expected \[0.0, 1.0\]"),
+        ({"max_expansions": 0}, "max_expansions=0 is out of range; expected"),
         ({"capacity": 33}, "capacity is 33; expected at least 34"),
     ],
 )

@@ -5,16 +5,24 @@ import math
 from typing import Any
 
 
-def setting(default: Any, low: float, high: float = math.inf, *, below: bool = False) -> Any:
+def setting(
+    default: Any,
+    low: float,
+    high: float = math.inf,
+    *,
+    below: bool = False,
+    optional: bool = False,
+) -> Any:
     """A dataclass field with a default and a range.
 
     Args:
-        default: the value that measures best; None is allowed where it is the default.
+        default: the value that measures best.
         low: smallest value.
         high: largest value.
         below: the value must stay below ``high``.
+        optional: None is allowed too.
     """
-    return dataclasses.field(default=default, metadata={"range": (low, high, below)})
+    return dataclasses.field(default=default, metadata={"range": (low, high, below, optional)})
 
 
 def check_settings(settings: Any, prefix: str = "") -> None:
@@ -28,11 +36,12 @@ def check_settings(settings: Any, prefix: str = "") -> None:
         if dataclasses.is_dataclass(value):
             check_settings(value, f"{prefix}{field.name}.")
             continue
-        if "range" not in field.metadata or (value is None and field.default is None):
+        if "range" not in field.metadata:
             continue
-        low, high, below = field.metadata["range"]
-        inside = value is not None and low <= value <= high and not (below and value == high)
-        if not inside:
+        low, high, below, optional = field.metadata["range"]
+        if value is None and optional:
+            continue
+        if value is None or not low <= value <= high or (below and value == high):
             bracket = ")" if below else "]"
             raise ValueError(
                 f"{prefix}{field.name}={value} is out of range; expected [{low}, {high}{bracket}"
