@@ -1,4 +1,6 @@
 import ast
+import importlib
+import pkgutil
 import re
 from pathlib import Path
 
@@ -22,6 +24,14 @@ def test_every_public_name_resolves_and_has_a_docstring():
     assert sorted(vrrt_jax.__all__) == vrrt_jax.__all__
     for name in vrrt_jax.__all__:
         assert getattr(vrrt_jax, name).__doc__, name
+
+
+@pytest.mark.parametrize("package", ["vrrt_jax", "nrp_jax"])
+def test_every_module_imports(package):
+    """Names that modules import from each other exist."""
+    found = importlib.import_module(package)
+    for module in pkgutil.walk_packages(found.__path__, f"{package}."):
+        importlib.import_module(module.name)
 
 
 def test_only_one_file_touches_mjx():

@@ -79,9 +79,8 @@ class Budget:
 
     max_iterations: int = setting(400, 1)
     settle_iterations: int = setting(6, 0)  # once matched, iterations without improvement
-    patience: int | None = setting(
-        25, 1, optional=True
-    )  # iterations without improvement; None = no limit
+    # Iterations without improvement after which it gives up; None = no limit.
+    patience: int | None = setting(25, 1, optional=True)
     min_improvement: float = setting(0.0, 0.0)  # an improvement is a loss this much smaller ...
     min_ratio: float = setting(0.97, 0.0, 1.0)  # ... and below this share of the one before
     attempts: int = setting(2, 1, 1024)  # the later ones from other seeds, without a verified path

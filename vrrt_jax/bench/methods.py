@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from vrrt_jax import planner
+from vrrt_jax.bench import baselines
 from vrrt_jax.bench.tasks import (
     Scenery,
     Task,
@@ -21,14 +22,13 @@ from vrrt_jax.bench.tasks import (
 )
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.edges import joint_error
+from vrrt_jax.core.result import Status
 from vrrt_jax.core.shortcut import path_length
-from vrrt_jax.core.types import Status
 from vrrt_jax.problems import self_model_path
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.verify import verify_path
 from vrrt_jax.scene.world import World, obstacle_list
 from vrrt_jax.splat.model import SelfModel, load_self_model
-from vrrt_jax.visual.policy import baselines
 
 METHODS = ("vrrt", "dr-robot", "prof-robot", "dr-robot-rrt-star")
 CONFIGS = ("default", "paper")

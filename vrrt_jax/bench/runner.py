@@ -50,7 +50,7 @@ class Benchmark:
 
     @property
     def collisions(self) -> bool:
-        """Whether there are obstacles, and paths are max_scored."""
+        """Whether there are obstacles, and paths are judged."""
         return self.what != "pose"
 
     def header(self) -> dict[str, Any]:

@@ -131,7 +131,9 @@ def _unusual(scenery: dict[str, Any]) -> list[str]:
 
 
 def _is_paper(results: dict[str, Any]) -> bool:
-    return results["variants"][0]["config"]["probes"] == 0
+    config = results["variants"][0]["config"]
+    # Older files have flat settings.
+    return (config["seeds"]["num"] if "seeds" in config else config["probes"]) == 0
 
 
 def _command(results: dict[str, Any]) -> str:

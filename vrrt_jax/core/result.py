@@ -85,7 +85,7 @@ class PlanResult:
         """One line for people."""
         times = ", ".join(f"{k.removesuffix('_s')} {v:.1f} s" for k, v in self.timing.items())
         others = len(self.alternatives)
-        ambiguous = f"; ambiguous: {others} other configurations look the same" if others else ""
+        ambiguous = f"; ambiguous: {others} other configurations match as well" if others else ""
         return (
             f"{self.status.name}: loss {self.loss:.2e} (goal {self.match_threshold:.2e}), "
             f"{len(self.path)} waypoints, cost {self.cost:.2f}, {self.iterations} iterations; "

@@ -39,11 +39,11 @@ SAME_LOSS = 1.05  # losses within this factor are the same match
 AMBIGUITY_RATIO = 1.1  # and within this factor the image does not tell which it is
 ADVICE = {
     Status.SOLVED: "",
-    Status.NO_MATCH: "check the camera and the self-model, add a view, or raise max_iterations",
-    Status.NO_PATH: "raise connect_iterations and tree.capacity, or move the obstacles",
-    Status.MAX_ITERATIONS: "raise max_iterations",
+    Status.NO_MATCH: "check the camera and the self-model, add a view, or raise budget.max_iterations",
+    Status.NO_PATH: "raise budget.connect_iterations and tree.capacity, or move the obstacles",
+    Status.MAX_ITERATIONS: "raise budget.max_iterations",
     Status.TREE_FULL: "raise tree.capacity",
-    Status.TIME_LIMIT: "raise time_limit_s",
+    Status.TIME_LIMIT: "raise budget.time_limit_s",
     Status.INTERRUPTED: "run it again",
     Status.NOT_VERIFIED: "lower the world's resolution or raise its margin",
 }
