@@ -4,6 +4,8 @@ import dataclasses
 
 from vrrt_jax.core.settings import check_settings, setting
 
+EDGE_STEPS = 64  # collision checks along an edge of a single tree (static)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PlannerConfig:

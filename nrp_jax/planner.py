@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nrp_jax.config import PlannerConfig, check_config
+from nrp_jax.config import EDGE_STEPS, PlannerConfig, check_config
 from nrp_jax.homes.grid import Grid
 from nrp_jax.planners.nrp import NeuralRRT
 from nrp_jax.samplers import check_fits, load_sampler
@@ -29,7 +29,6 @@ from vrrt_jax.core.types import ExpansionPolicy
 
 PLANNERS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g")
 KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae"}  # of the samplers that planners need
-EDGE_STEPS = 64  # of an edge of the single trees
 ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
 ADVICE = {
     Status.SOLVED: "",

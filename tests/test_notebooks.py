@@ -1,5 +1,6 @@
 """The notebooks run from top to bottom."""
 
+import runpy
 from pathlib import Path
 
 import nbformat
@@ -24,3 +25,11 @@ def test_notebook_runs(path, tmp_path, monkeypatch):
     resources = {"metadata": {"path": str(tmp_path)}}
     NotebookClient(notebook, timeout=400, kernel_name="python3", resources=resources).execute()
     assert (tmp_path / picture).stat().st_size > 20_000
+
+
+def test_a_planner_of_ones_own_plans(capsys):
+    """The example for those who write planners runs as a script, and solves its problem."""
+    script = Path(__file__).parents[1] / "notebooks" / "write_a_planner.py"
+    scope = runpy.run_path(str(script), run_name="__main__")
+    assert scope["result"].ok
+    assert capsys.readouterr().out.startswith("SOLVED")

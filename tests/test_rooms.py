@@ -21,6 +21,7 @@ VRRT_ROOMS = (
     ("cli",),
 )
 NRP_ROOMS = (
+    ("config",),
     ("homes",),
     ("scene",),
     ("learning",),

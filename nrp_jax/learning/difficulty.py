@@ -12,19 +12,23 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from nrp_jax.config import EDGE_STEPS
 from nrp_jax.homes.grid import Grid
 from nrp_jax.homes.houses import House, floor, generate_house
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld, batch_is_free, build_world
-from vrrt_jax.core.planners.rrt import sample_configurations
+from vrrt_jax.core.goal import ConfigurationGoal
+from vrrt_jax.core.planners.rrt import RRT, sample_configurations
+from vrrt_jax.core.search import StopReason, initial_state, make_termination, run_chunk
 
 EXPANSIONS = 300  # of RRT-IS for a query
 MIN_GEODESIC = 5.0  # shortest path of the base from start to goal in a long query [m]
 GOAL_BIAS = 0.1  # share of expansions that aim at the goal
 FAIR = (0.2, 0.6)  # difficulty of a fair home
-_CAPACITY = 1 << 13  # nodes of a tree
-_SUB_STEPS = 160  # of an extension, at most
-_CHUNK = 16  # sub-steps checked at a time
+CAPACITY = 1 << 13  # nodes of a tree
+RRT_IS = RRT(
+    goal_bias=GOAL_BIAS, keep_partial=True, intermediate=True, lanes=1, edge_steps=EDGE_STEPS
+)
 
 
 def difficulty(robot: MobileRobot, grid: Grid, num: int = 20, seed: int = 0) -> float:
@@ -42,7 +46,7 @@ def difficulty(robot: MobileRobot, grid: Grid, num: int = 20, seed: int = 0) -> 
     world = build_world(robot, grid)
     starts, goals = long_queries(robot, world, grid, num, seed)
     keys = jax.random.split(jax.random.key(seed), num)
-    solved = [rrt_is(world, *query) for query in zip(starts, goals, keys, strict=True)]
+    solved = [is_solved(world, *query) for query in zip(starts, goals, keys, strict=True)]
     return float(np.mean(solved))
 
 
@@ -117,59 +121,15 @@ def _floor_graph(index: np.ndarray, resolution: float) -> sparse.csr_matrix:
 
 
 @jax.jit
-def rrt_is(world: GridWorld, q_start: jax.Array, q_goal: jax.Array, key: jax.Array) -> jax.Array:
+def is_solved(world: GridWorld, q_start: jax.Array, q_goal: jax.Array, key: jax.Array) -> jax.Array:
     """Whether RRT-IS reaches the goal (D,) from the start (D,) within 300 expansions, () bool.
 
-    One extension after the other, as the paper counts expansions. The planner's RRT-IS
-    (:class:`vrrt_jax.core.planners.rrt.RRT`) extends many nodes at a time and would measure another
-    difficulty; homes of data sets depend on this one.
+    It is the planner "rrt-is" with a single lane: one expansion after the other, as the paper
+    counts them.
     """
-    nodes = jnp.zeros((_CAPACITY, q_start.shape[0])).at[0].set(q_start)
-    step = jnp.arange(1, _SUB_STEPS + 1)
-
-    def goes_on(state):
-        _, size, expansion, reached = state
-        return ~reached & (expansion < EXPANSIONS) & (size < _CAPACITY)
-
-    def expand(state):
-        nodes, size, expansion, _ = state
-        # The node nearest to a random configuration, or to the goal.
-        key_q, key_bias = jax.random.split(jax.random.fold_in(key, expansion))
-        aims = jax.random.uniform(key_bias) < GOAL_BIAS
-        target = jnp.where(aims, q_goal, sample_configurations(world, key_q, 1)[0])
-        among = (jnp.arange(_CAPACITY) < size)[None]
-        nearest = nodes[jnp.argmin(world.distances(nodes, target[None], among)[0])]
-        # The sub-steps from there to the target, and how many of them come before a collision.
-        edge = world.edge(nearest, target)
-        num = jnp.minimum(world.parts(edge, _SUB_STEPS), _SUB_STEPS)
-        points = jax.vmap(
-            lambda f: world.normalize(world.end(nearest, world.truncate(edge, f)))
-        )(step / num)  # fmt: skip
-        passed = _free_steps(world, points, num)
-        # All of these become nodes.
-        slot = jnp.where(step <= passed, size + step - 1, _CAPACITY)
-        nodes = nodes.at[slot].set(points, mode="drop")
-        return nodes, size + passed, expansion + 1, aims & (passed == num)
-
-    state = (nodes, jnp.int32(1), jnp.int32(0), jnp.array(False))
-    return jax.lax.while_loop(goes_on, expand, state)[3]
-
-
-def _free_steps(world: GridWorld, points: jax.Array, num: jax.Array) -> jax.Array:
-    """How many of the first ``num`` () points (S, D) come before the first that collides.
-
-    :func:`vrrt_jax.core.edges.free_prefix` checks all sub-steps of many edges in one batch. Here
-    is a single edge, most of whose sub-steps lie behind the first collision: chunks are faster.
-    """
-
-    def goes_on(state):
-        checked, passed = state
-        return (checked == passed) & (checked < num)
-
-    def check(state):
-        checked, passed = state
-        free = jax.vmap(world.is_free)(jax.lax.dynamic_slice_in_dim(points, checked, _CHUNK))
-        free &= checked + jnp.arange(1, _CHUNK + 1) <= num
-        return checked + _CHUNK, passed + jnp.sum(jnp.cumprod(free))
-
-    return jax.lax.while_loop(goes_on, check, (jnp.int32(0), jnp.int32(0)))[1]
+    goal, policy = ConfigurationGoal(q=q_goal), RRT_IS
+    tree = policy.init(world, goal, q_start[None], CAPACITY)
+    termination = make_termination(policy.goal_score(goal), max_iterations=EXPANSIONS)
+    state = initial_state(tree)
+    state, reason = run_chunk(world, goal, policy, state, termination, key, jnp.int32(EXPANSIONS))
+    return reason == StopReason.REACHED

@@ -7,7 +7,7 @@ import pytest
 from nrp_jax import build_world, load_robot
 from nrp_jax.homes import houses
 from nrp_jax.homes.grid import Grid
-from nrp_jax.learning.difficulty import FAIR, difficulty, fair_house, long_queries, rrt_is
+from nrp_jax.learning.difficulty import FAIR, difficulty, fair_house, is_solved, long_queries
 
 
 def empty_room(side: int = 100) -> Grid:
@@ -27,7 +27,7 @@ def test_difficulty_of_an_empty_room_and_of_a_closed_one():
     assert (np.linalg.norm(starts[:, :2] - goals[:, :2], axis=1) > 4).all()
     across = starts[0].copy()
     across[0] = 10 - across[0]
-    assert not rrt_is(world, starts[0], across, jax.random.key(0))
+    assert not is_solved(world, starts[0], across, jax.random.key(0))
     with pytest.raises(ValueError, match="too small"):
         difficulty(robot, empty_room(40), num=2)
 

@@ -383,11 +383,11 @@ def test_a_subclass_is_obeyed_by_every_function(worlds, rng, name, kind):
     expected = before & outside
     assert before.sum() > expected.sum() > 0
     np.testing.assert_array_equal(nrp_jax.batch_is_free(zone, q), expected)
-    np.testing.assert_array_equal(jax.vmap(zone.is_free)(jnp.asarray(q)), expected)
-    assert not bool(nrp_jax.is_free(zone, jnp.asarray(q[np.argmax(before & ~outside)])))
+    np.testing.assert_array_equal(jax.jit(jax.vmap(zone.is_free))(jnp.asarray(q)), expected)
+    assert not bool(jax.jit(nrp_jax.is_free)(zone, jnp.asarray(q[np.argmax(before & ~outside)])))
     # The kernel stops at the zone, and so do its edges.
     start, inside = q[np.argmax(expected)][None], q[np.argmax(before & ~outside)][None]
     edge = zone.edge(jnp.asarray(start), jnp.asarray(inside))
-    steps = int(free_prefix(zone, jnp.asarray(start), edge, 64)[0])
+    steps = int(jax.jit(free_prefix, static_argnums=3)(zone, jnp.asarray(start), edge, 64)[0])
     assert steps < 64
     assert isinstance(nrp_jax.with_grid(zone, grid), kind)

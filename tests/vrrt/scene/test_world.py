@@ -12,7 +12,7 @@ from vrrt_jax.robots.kinematics import batch_link_poses, link_poses
 from vrrt_jax.scene.closed_form import ClosedFormWorld
 from vrrt_jax.scene.mjx import mjx_is_free, mjx_world
 from vrrt_jax.scene.obstacles import load_obstacles, signed_distances
-from vrrt_jax.scene.world import World, batch_is_free, with_margin
+from vrrt_jax.scene.world import World, batch_is_free, overrides_is_free, with_margin
 
 DISTANCE_TOLERANCE = 2e-5  # [m]; worst seen 4e-6, near a plane drawn as a 100 m box
 
@@ -217,6 +217,10 @@ def test_a_subclass_stays_itself(keep_out):
     for world in (*changed, vrrt_jax.move_obstacle(keep_out, "ball", position=(0, 0, 2))):
         assert isinstance(world, KeepOut)
         np.testing.assert_array_equal(world.keep_out, keep_out.keep_out)
+
+
+def test_only_a_users_answer_counts_as_an_override(wall_world, keep_out):
+    assert overrides_is_free(keep_out) and not overrides_is_free(wall_world)
 
 
 def test_a_new_zone_does_not_retrace(keep_out):

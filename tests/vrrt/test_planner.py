@@ -1,0 +1,233 @@
+"""Planning from the outside: goals, planners, no re-compilation, attempts, batches."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pictures import Q_GOAL, Q_START, QUICK, picture
+
+import vrrt_jax
+from vrrt_jax import ImageGoal, PlannerConfig, planner
+from vrrt_jax.core import search as searches
+from vrrt_jax.core.result import with_time_of
+
+
+def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
+    panda, self_model, camera, image, open_world, monkeypatch
+):
+    traces = []
+    original = searches.run_chunk
+
+    def counted(*args):
+        traces.append(1)
+        return original(*args)
+
+    monkeypatch.setattr(searches, "_chunk", jax.jit(counted))
+
+    def run(world=open_world, image=image, q_start=Q_START, model=self_model, changes=None):
+        return vrrt_jax.plan(
+            panda,
+            world,
+            ImageGoal(model, camera, image),
+            q_start,
+            key=jax.random.key(0),
+            config=PlannerConfig().changed(changes or {}),
+        )
+
+    result = run()
+    assert result.ok and result.verification is not None and result.verification.ok
+    assert np.abs(result.q_goal - Q_GOAL).mean() < 0.05
+    np.testing.assert_allclose(result.path[0], Q_START, atol=1e-6)
+    again = run()
+    np.testing.assert_array_equal(result.path, again.path)
+
+    moved = vrrt_jax.move_obstacle(open_world, "ball", position=(0.0, -0.9, 0.9))
+    lighter = dataclasses.replace(
+        self_model,
+        levels=tuple(
+            dataclasses.replace(
+                level, splats=dataclasses.replace(level.splats, rgb=0.9 * level.splats.rgb)
+            )
+            for level in self_model.levels
+        ),
+    )
+    before = len(traces)  # one of the visual search, one of the connection to its match
+    assert before <= 2
+    few = {"budget.max_iterations": 4, "budget.attempts": 1, "polish.rounds": 1}
+    run(world=moved, changes=few)
+    run(image=picture(panda, self_model, camera, Q_GOAL + 0.1), changes=few)
+    run(q_start=Q_START + 0.1, changes=few)
+    run(model=lighter, changes=few)
+    expand = {"alpha": 0.02, "epsilon": 0.1, "kappa": 0.5, "eta": 0.3, "exploration": 0.5}
+    run(changes=few | {f"expand.{name}": value for name, value in expand.items()})
+    run(changes=few | {"expand.beta1": 0.5, "expand.inherit": False})
+    assert len(traces) == before
+    run(changes=few | {"tree.lanes": 4})
+    assert len(traces) > before
+
+
+def test_batch_equals_single_plans(panda, self_model, camera, image, open_world):
+    config = QUICK.changed(
+        {"budget.max_iterations": 10, "budget.settle_iterations": 0, "tree.rewiring": False}
+    )
+    other = picture(panda, self_model, camera, Q_GOAL + 0.2)
+    key = jax.random.key(5)
+    starts = np.stack([Q_START, Q_START + 0.05])
+    batch = vrrt_jax.plan_batch(
+        panda, open_world, self_model, camera, [image, other], starts, key=key, config=config
+    )
+    for i, goal in enumerate((image, other)):
+        single = vrrt_jax.plan(
+            panda,
+            open_world,
+            ImageGoal(self_model, camera, goal),
+            starts[i],
+            key=jax.random.fold_in(key, i),
+            config=config,
+        )
+        size = int(single.tree.size)
+        assert int(batch[i].tree.size) == size
+        assert batch[i].status is single.status
+        # Sums of floats differ in order, and sign-like Adam steps amplify it: compare early nodes.
+        np.testing.assert_allclose(batch[i].tree.q[:80], single.tree.q[:80], atol=1e-3)
+
+
+def test_the_short_form_is_an_image_goal(panda, self_model, camera, image, open_world):
+    config = QUICK.changed({"budget.max_iterations": 3, "budget.attempts": 1, "polish.rounds": 1})
+    mask = np.ones(image.shape[:2], bool)
+    mask[360:] = False
+    run: dict = {"key": jax.random.key(3), "config": config}
+    short = vrrt_jax.plan(panda, open_world, self_model, camera, image, Q_START, mask=mask, **run)
+    goal = ImageGoal(self_model, camera, image, mask)
+    long = vrrt_jax.plan(panda, open_world, goal, q_start=Q_START, **run)
+    np.testing.assert_array_equal(short.path, long.path)
+    assert short.loss == long.loss
+    with pytest.raises(ValueError, match=r"expected ImageGoal\(..., mask=mask\)"):
+        vrrt_jax.plan(panda, open_world, goal, Q_START, mask=mask, **run)
+    with pytest.raises(ValueError, match="got 1 inputs after the goal; expected camera"):
+        vrrt_jax.plan(panda, open_world, self_model, Q_START, **run)  # type: ignore[call-overload]
+
+
+def test_holes_in_the_image_are_planned_around(panda, self_model, camera, open_world):
+    image = picture(panda, self_model, camera, Q_GOAL, level=3)
+    mask = np.random.default_rng(0).random(image.shape[:2]) < 0.9
+    mask[360:] = False  # the foot of the robot
+    holed = np.where(mask[..., None], image, 1.0)
+    key = jax.random.key(2)
+    result = vrrt_jax.plan(
+        panda, open_world, self_model, camera, holed, Q_START, key=key, config=QUICK, mask=mask
+    )
+    assert result.ok, str(result)
+    assert np.abs(result.q_goal - Q_GOAL).max() < 0.05
+
+
+def test_another_attempt_while_nothing_matches(
+    panda, self_model, camera, image, open_world, monkeypatch
+):
+    config = QUICK.changed({"budget.patience": 1, "match.scale": 1e-6, "polish.hypotheses": 0})
+    args = (panda, open_world, self_model, camera, image, Q_START)
+    results, begun = [], []
+    for attempts in (1, 3):
+        seen = []
+        results.append(
+            vrrt_jax.plan(
+                *args,
+                key=jax.random.key(0),
+                config=config.changed({"budget.attempts": attempts}),
+                on_progress=lambda state, seconds: seen.append(int(state.tree.iteration)),  # noqa: B023
+            )
+        )
+        begun.append(1 + int(np.sum(np.diff(seen) <= 0)))
+    assert begun == [1, 3]
+    assert all(r.status is vrrt_jax.Status.NO_MATCH for r in results)
+    assert results[1].loss <= results[0].loss
+    spent = with_time_of(results[0], *results).timing["search_s"]
+    assert spent == results[0].timing["search_s"] + results[1].timing["search_s"]
+
+    ended = dataclasses.replace(results[1], status=vrrt_jax.Status.INTERRUPTED, loss=0.0)
+    attempts = iter([results[0], ended])  # whose losses are of other images
+    monkeypatch.setattr(planner, "_attempt", lambda *_: next(attempts))
+    result = vrrt_jax.plan(*args, key=jax.random.key(0), config=config)
+    assert result.status is vrrt_jax.Status.INTERRUPTED and result.loss == results[0].loss
+
+
+def test_a_guess_becomes_a_root(panda, self_model, camera, image, open_world):
+    config = QUICK.changed({"seeds.num": 0, "budget.max_iterations": 3, "polish.hypotheses": 0})
+    args = (panda, open_world, self_model, camera, image, Q_START)
+    told = vrrt_jax.plan(*args, key=jax.random.key(0), config=config, q_guess=Q_GOAL + 0.05)
+    np.testing.assert_allclose(told.tree.q[1], Q_GOAL + 0.05, atol=1e-6)
+    assert told.loss < vrrt_jax.plan(*args, key=jax.random.key(0), config=config).loss
+    with pytest.raises(ValueError, match="the guess is outside the limits: joint 'joint4'"):
+        vrrt_jax.plan(*args, key=jax.random.key(0), config=config, q_guess=np.zeros(7) + 1)
+
+
+TURNTABLE = """<mujoco><worldbody><body name="arm"><joint name="turn" axis="0 0 1" limited="false"/>
+<geom type="sphere" size="0.05" pos="0.3 0 0"/></body></worldbody></mujoco>"""
+
+
+def test_paths_go_on_where_a_joint_wraps(tmp_path, panda):
+    (tmp_path / "turntable.xml").write_text(TURNTABLE)
+    robot = vrrt_jax.load_robot(tmp_path / "turntable.xml")
+    world = vrrt_jax.build_world(robot, [])
+    q_start, q_goal = np.array([3.0 + 2 * np.pi]), np.array([-3.0])
+    result = vrrt_jax.plan_to_configuration(robot, world, q_start, q_goal, key=jax.random.key(0))
+    assert result.ok
+    assert result.path[0] == pytest.approx(3.0, abs=1e-5)
+    assert result.path[-1] == pytest.approx(2 * np.pi - 3.0, abs=1e-5)
+    with pytest.raises(ValueError, match="the world is of a robot with joints turn; this one"):
+        vrrt_jax.plan_to_configuration(panda, world, Q_START, Q_GOAL, key=jax.random.key(0))
+
+
+def test_joint_goals(panda, wall_world):
+    goal = Q_START * np.array([-1, 1, 1, 1, 1, 1, 1], np.float32)
+    result = vrrt_jax.plan_to_configuration(panda, wall_world, Q_START, goal, key=jax.random.key(0))
+    assert result.ok
+    np.testing.assert_allclose(result.path[[0, -1]], [Q_START, goal], atol=1e-5)
+    with pytest.raises(ValueError, match="unknown planner 'prm'; have: rrt, rrt-star"):
+        vrrt_jax.plan_to_configuration(
+            panda, wall_world, Q_START, goal, key=jax.random.key(0), planner="prm"
+        )
+
+
+@vrrt_jax.pytree
+class HandGoal(vrrt_jax.LeastSquaresGoal):
+    """The hand should be at a place: a goal of somebody's own."""
+
+    place: jax.Array  # (3,) [m]
+    threshold: Any = 1e-5  # [m^2]
+
+    def residual(self, world, q):
+        return vrrt_jax.link_poses(world.chain, q)[-1, :3, 3] - self.place
+
+
+def test_a_goal_of_ones_own(panda, open_world):
+    place = vrrt_jax.link_poses(panda.chain, jnp.asarray(Q_GOAL))[-1, :3, 3]
+    result = vrrt_jax.plan(
+        panda, open_world, HandGoal(place=place), Q_START, key=jax.random.key(0), config=QUICK
+    )
+    assert result.ok, str(result)
+    hand = vrrt_jax.link_poses(panda.chain, jnp.asarray(result.path[-1]))[-1, :3, 3]
+    assert float(jnp.linalg.norm(hand - place)) < 4e-3
+    with pytest.raises(ValueError, match="'rrt-connect' needs a ConfigurationGoal"):
+        vrrt_jax.plan(
+            panda,
+            open_world,
+            HandGoal(place=place),
+            Q_START,
+            key=jax.random.key(0),
+            planner="rrt-connect",
+        )
+
+
+def test_what_is_no_goal_and_what_is_no_planner_is_refused(panda, open_world):
+    key = jax.random.key(0)
+    with pytest.raises(ValueError, match="the goal ndarray lacks loss, threshold"):
+        vrrt_jax.plan(panda, open_world, Q_GOAL, Q_START, key=key)
+    goal = vrrt_jax.ConfigurationGoal(q=Q_GOAL)
+    with pytest.raises(ValueError, match="the planner RRT is a class; expected an object"):
+        vrrt_jax.plan(panda, open_world, goal, Q_START, key=key, planner=vrrt_jax.RRT)
+    with pytest.raises(ValueError, match="the planner object lacks edge_steps, lanes, init"):
+        vrrt_jax.plan(panda, open_world, goal, Q_START, key=key, planner=object())

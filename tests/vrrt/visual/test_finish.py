@@ -1,0 +1,129 @@
+"""From the ends of a search to a result: rivals, straight paths, matches without a way."""
+
+import dataclasses
+import types
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pictures import HALF_TURNED, Q_GOAL, Q_START, picture
+
+import vrrt_jax
+from vrrt_jax import ImageGoal, PlannerConfig, VisualRRT
+from vrrt_jax.core import tree as trees
+from vrrt_jax.core.edges import free_prefix
+from vrrt_jax.core.search import SearchResult, StopReason
+from vrrt_jax.visual import finish
+from vrrt_jax.visual.polish import Polished
+from vrrt_jax.visual.problem import make_problem
+
+
+def finished(tree):
+    return SearchResult(
+        tree=tree,
+        stopped=StopReason.REACHED,
+        history=np.zeros((1, 4)),
+        compile_s=0.0,
+        search_s=0.0,
+    )
+
+
+def test_ambiguous_goals_are_told(panda, self_model, camera, open_world):
+    """With a slack threshold, the hand after half a turn matches too: both ends are named."""
+    image = picture(panda, self_model, camera, Q_GOAL, level=2)
+    config = PlannerConfig().changed({"match.scale": 20.0, "polish.rounds": 1})
+    problem = make_problem(panda, ImageGoal(self_model, camera, image), Q_START, config)
+    roots = np.stack([Q_START, Q_GOAL, HALF_TURNED])
+    policy = VisualRRT.from_config(config)
+    found = finished(policy.init(open_world, problem.goal, roots, config.tree.capacity))
+    args = (panda, open_world, problem, found, Q_START, jax.random.key(0), config)
+    result = finish.finish_visual(*args)
+    assert result.ok
+    np.testing.assert_allclose(result.target, Q_GOAL, atol=0.02)
+    assert len(result.alternatives) == 0  # an exact image tells them apart
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(finish, "AMBIGUITY_RATIO", np.inf)
+        result = finish.finish_visual(*args)
+    apart = np.abs(result.alternatives - HALF_TURNED).max(axis=1)
+    assert len(apart) >= 1 and apart.min() < 0.3
+    assert f"ambiguous: {len(apart)} other" in str(result)
+
+
+SLIDER = """
+<mujoco>
+  <worldbody>
+    <body>
+      <joint name="slide" type="slide" axis="1 0 0" range="-1 1"/>
+      <geom type="box" size="0.1 0.1 0.1"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def slider(tmp_path_factory):
+    path = tmp_path_factory.mktemp("robots") / "slider.xml"
+    path.write_text(SLIDER)
+    return vrrt_jax.load_robot(path)
+
+
+def beside(y):
+    """A box that leaves ``y`` - 0.15 m to the slider that passes it."""
+    return vrrt_jax.Obstacle(name="box", kind="box", position=(0, y, 0), size=(0.05, 0.05, 0.05))
+
+
+@pytest.mark.parametrize("margin, granted", [(0.0, True), (0.001, False)])
+def test_a_straight_way_that_only_the_spheres_refuse(slider, margin, granted):
+    world = vrrt_jax.build_world(slider, [beside(0.1525)], margin=margin)
+    ends = np.array([[-0.5], [0.5]], np.float32)
+    edge = world.edge(jnp.asarray(ends[:1]), jnp.asarray(ends[1:]))
+    steps = int(free_prefix(world, jnp.asarray(ends[:1]), edge, 64)[0])
+    assert 0 < steps < 64
+    found = finished(trees.create(jnp.asarray(ends), jnp.zeros(2), None, 8))
+    _, way = finish._straight(slider, world, found, *ends)
+    assert (way is not None) == granted
+    if granted:
+        np.testing.assert_array_equal(way, ends)
+
+
+class NoPassage(type(vrrt_jax.build_world(vrrt_jax.load_robot("panda")))):
+    """A world where nobody passes x = 0, which no obstacle tells."""
+
+    def is_free(self, q):
+        return super().is_free(q) & (jnp.abs(q[0]) > 0.05)
+
+
+def test_a_straight_path_obeys_an_is_free_of_ones_own(slider):
+    world = vrrt_jax.build_world(slider, [])
+    ends = np.array([[-0.5], [0.5]], np.float32)
+    found = finished(trees.create(jnp.asarray(ends), jnp.zeros(2), None, 8))
+    assert finish._straight(slider, world, found, *ends)[1] is not None
+    fields = {field.name: getattr(world, field.name) for field in dataclasses.fields(world)}
+    assert finish._straight(slider, NoPassage(**fields), found, *ends)[1] is None
+
+
+def test_a_match_without_a_way_is_told(slider, monkeypatch):
+    """What can be reached but does not match is no substitute for it."""
+    world = vrrt_jax.build_world(slider, [beside(0.1)])
+    q = np.array([[-0.4], [0.5]], np.float32)
+    losses = np.array([2.0, 0.5])
+    polished = Polished(q=q, loss=losses, cost=losses)
+    monkeypatch.setattr(finish, "polish", lambda *_: polished)
+    found = finished(trees.create(jnp.asarray(q), jnp.ones(2), None, 8))
+    config = PlannerConfig().changed(
+        {"tree.lanes": 4, "tree.capacity": 64, "budget.connect_iterations": 5}
+    )
+    goal = types.SimpleNamespace(threshold=1.0)
+    problem: Any = types.SimpleNamespace(goal=goal, polishing=goal)
+    start = np.array([-0.5], np.float32)
+    args = (slider, world, problem, found, start, jax.random.key(0), config)
+    result = finish.finish_visual(*args)
+    assert result.status is vrrt_jax.Status.NO_PATH and result.target == q[1]
+    assert len(result.alternatives) == 0 and result.verification is None
+    assert "move the obstacles" in result.advice
+    polished = Polished(q=q, loss=np.ones(2), cost=np.ones(2))
+    result = finish.finish_visual(*args)
+    assert result.ok and result.target == q[0]

@@ -1,0 +1,71 @@
+"""Image goals: losses and residuals agree, several views, masks, losses of one's own."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+from pictures import Q_GOAL, Q_START, QUICK, picture
+
+import vrrt_jax
+from vrrt_jax import ImageGoal, ImageObjective
+from vrrt_jax.visual.problem import make_problem
+
+IMAGE_PX = QUICK.tree.image_px
+
+
+def test_residuals_make_the_loss(panda, self_model, camera, image, open_world, rng):
+    mask = rng.random(image.shape[:2]) < 0.8
+    goal = ImageGoal(self_model, [camera, camera], [image, image], [mask, mask])
+    objective = goal.at(panda, IMAGE_PX)
+    assert 0.5 < float(objective.image.valid.mean()) < 0.9
+    q = jnp.asarray(Q_START)
+    residual = jax.jit(objective.residual)(open_world, q)
+    loss = jax.jit(objective.loss)(open_world, q)
+    assert float(jnp.sum(residual**2)) == pytest.approx(float(loss), rel=1e-4)
+
+
+def test_a_mask_that_hides_the_robot_is_refused(panda, self_model, camera, image):
+    hiding = image[..., 3] == 0
+    with pytest.raises(ValueError, match="the masks leave nothing of the robot"):
+        ImageGoal(self_model, camera, image, hiding).at(panda, IMAGE_PX)
+
+
+def test_several_views(panda, self_model, camera, image, open_world):
+    second = vrrt_jax.look_at((-0.4, 1.9, 0.9), (0.1, 0.0, 0.4), height=480, width=480)
+    images = [image, picture(panda, self_model, second, Q_GOAL)]
+    objective = ImageGoal(self_model, [camera, second], images).at(panda, IMAGE_PX)
+    assert objective.image.rgb.shape[0] == 2
+    loss = jax.jit(objective.loss)
+    at_goal, at_start = (float(loss(open_world, jnp.asarray(q))) for q in (Q_GOAL, Q_START))
+    assert at_goal < 0.1 * at_start
+
+
+class HalfLoss(ImageObjective):
+    """Half of the image loss."""
+
+    def loss(self, world, q):
+        return 0.5 * super().loss(world, q)
+
+
+def test_a_loss_of_ones_own_reaches_search_seeds_polishing_and_match(
+    panda, self_model, camera, image, open_world
+):
+    q = jnp.asarray(Q_START)
+    losses = []
+    for objective in (ImageObjective, HalfLoss):
+        goal = ImageGoal(self_model, camera, image, objective=objective)
+        problem = make_problem(panda, goal, Q_START, QUICK)
+        polishing = problem.polishing
+        assert polishing is not None and polishing.close_up is not None
+        stages = (
+            problem.goal,
+            problem.seeds.goal,
+            polishing.coarse.goal,
+            polishing.fine.goal,
+            polishing.close_up.objective,
+        )
+        assert all(type(stage) is objective for stage in stages)
+        loss = float(problem.goal.loss(open_world, q))
+        residual = problem.goal.residual(open_world, q)
+        assert float(jnp.sum(residual**2)) == pytest.approx(loss, rel=1e-4)
+        losses.append(loss)
+    assert losses[1] == pytest.approx(0.5 * losses[0], rel=1e-5)

@@ -1,0 +1,62 @@
+"""Polishing: least squares where images tell little."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from pictures import HALF_TURNED, Q_GOAL, Q_START, picture
+
+import vrrt_jax
+from vrrt_jax import ImageGoal, PlannerConfig, PolishConfig
+from vrrt_jax.visual.polish import LINEARIZE_BATCH, _hand_goal, linearize, polish
+from vrrt_jax.visual.problem import make_problem
+
+
+def polishing_of(panda, self_model, camera, image, config):
+    problem = make_problem(panda, ImageGoal(self_model, camera, image), Q_START, config)
+    assert problem.polishing is not None
+    return problem.polishing
+
+
+def test_steps_lead_where_the_gradient_does(panda, self_model, camera, image, open_world):
+    """Differences that are too long lose the weak directions, where steps are the longest."""
+    config = PlannerConfig(polish=PolishConfig(start_prior=0.0))
+    coarse = polishing_of(panda, self_model, camera, image, config).coarse
+    noise = np.random.default_rng(0).normal(size=(LINEARIZE_BATCH, 7))
+    q = jnp.asarray(Q_GOAL + 0.03 * noise, jnp.float32)
+    gradient = jax.jit(jax.vmap(jax.grad(lambda q: coarse.goal.loss(open_world, q))))(q)
+    model = jax.device_get(linearize(open_world, coarse, q))
+    matrix, slope = model[3], model[4]
+    step = np.linalg.solve(matrix, slope[..., None])[..., 0]
+    exact = np.linalg.solve(matrix, 0.5 * np.asarray(gradient)[..., None])[..., 0]
+    np.testing.assert_allclose(step, exact, atol=0.1 * np.abs(exact).max())
+
+
+def test_polishing_turns_the_wrist_back(panda, self_model, camera, open_world):
+    image = picture(panda, self_model, camera, Q_GOAL, level=2)
+    config = PlannerConfig(polish=PolishConfig(hypotheses=2))
+    polishing = polishing_of(panda, self_model, camera, image, config)
+    turned = Q_GOAL + np.array([0.02, 0, -0.02, 0, 0.05, 0.05, 0.9], np.float32)
+    found = polish(open_world, polishing, turned[None], 0)
+    assert found.loss[0] < polishing.threshold and np.all(np.diff(found.cost) >= 0)
+    assert np.abs(np.asarray(found.q[0]) - Q_GOAL).max() < 0.05
+    inside_ball = vrrt_jax.move_obstacle(
+        open_world, "ball", position=_hand_position(panda, Q_GOAL), size=(0.2, 0, 0)
+    )
+    found = polish(inside_ball, polishing, turned[None], 0)
+    assert not np.isfinite(found.cost).any()  # what matches is in collision
+
+
+def test_a_close_up_tells_half_a_turn(panda, self_model, camera, open_world):
+    image = picture(panda, self_model, camera, Q_GOAL, level=3)
+    polishing = polishing_of(panda, self_model, camera, image, PlannerConfig())
+    assert polishing.close_up is not None
+    hand, threshold = _hand_goal(open_world, polishing.fine, polishing.close_up, Q_GOAL)
+    assert hand.goal.image.rgb.shape[1:3] == (polishing.close_up.px,) * 2
+    q = np.resize(np.stack([Q_GOAL, HALF_TURNED]), (LINEARIZE_BATCH, 7))
+    losses = [np.asarray(linearize(open_world, at, q)[1]) for at in (polishing.fine, hand)]
+    fine, close = (loss[1] / loss[0] for loss in losses)
+    assert close > fine > 1 and losses[1][0] < threshold
+
+
+def _hand_position(panda, q):
+    return np.asarray(vrrt_jax.link_poses(panda.chain, jnp.asarray(q)))[-1, :3, 3].tolist()
