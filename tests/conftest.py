@@ -1,5 +1,8 @@
 """Shared fixtures: one robot, one world and few compiled functions for all files."""
 
+import ctypes
+import gc
+import sys
 from pathlib import Path
 
 import jax
@@ -7,10 +10,22 @@ import numpy as np
 import pytest
 
 import vrrt_jax
+from vrrt_jax.scene import exact
 
 # Compiled programs survive between runs and are shared by pytest-xdist's workers.
 jax.config.update("jax_compilation_cache_dir", str(Path.home() / ".cache" / "vrrt_jax_tests"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forget_what_was_compiled():
+    """Each file begins without the programs and scenes of the one before: few files share any."""
+    yield
+    jax.clear_caches()
+    exact._build.cache_clear()
+    gc.collect()
+    if sys.platform == "linux":  # freed memory goes back to the system, not into fragments
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 @pytest.fixture(scope="session")

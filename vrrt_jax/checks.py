@@ -9,7 +9,7 @@ import numpy as np
 from vrrt_jax.robots.kinematics import Chain, link_poses
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.verify import contacts
-from vrrt_jax.scene.world import World, batch_is_free, obstacle_list
+from vrrt_jax.scene.world import World, batch_is_free, obstacle_list, overrides_is_free
 from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera, SplatModel
@@ -62,6 +62,11 @@ def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.n
         touching = contacts(robot, obstacles, q) or contacts(
             robot, obstacles, q, geometry="spheres"
         )
+        if not touching and overrides_is_free(world):
+            raise ValueError(
+                f"the {what} is refused by {type(world).__name__}.is_free, though nothing touches; "
+                "move the robot or change that rule"
+            )
         raise ValueError(
             f"the {what} is in collision: {'; '.join(touching[:4]) or 'within the margin'}; move "
             "the robot or the obstacle"

@@ -256,7 +256,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     for level in (*model.levels, model.close_up):
         print(
             f"{level.splats.num_splats} splats at {level.size_px} px: {level.psnr_db:.1f} dB on "
-            f"{model.info['num_validation']} unseen poses and cameras, match bar "
+            f"{model.info['num_validation']} unseen poses and cameras, match threshold "
             f"{level.match_threshold:.3g} of the covered share"
         )
     print(f"wrote {arguments.out} after {model.info['seconds']:.0f} s, seed {model.seed}")

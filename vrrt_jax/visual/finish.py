@@ -39,7 +39,9 @@ SAME_LOSS = 1.05  # losses within this factor are the same match
 AMBIGUITY_RATIO = 1.1  # and within this factor the image does not tell which it is
 ADVICE = {
     Status.SOLVED: "",
-    Status.NO_MATCH: "check the camera and the self-model, add a view, or raise budget.max_iterations",
+    Status.NO_MATCH: (
+        "check the camera and the self-model, add a view, or raise budget.max_iterations"
+    ),
     Status.NO_PATH: "raise budget.connect_iterations and tree.capacity, or move the obstacles",
     Status.MAX_ITERATIONS: "raise budget.max_iterations",
     Status.TREE_FULL: "raise tree.capacity",

@@ -118,7 +118,7 @@ def _attempt(**changes):
 
 
 @pytest.mark.parametrize(
-    ("changes", "max_scored", "cause"),
+    ("changes", "judged", "cause"),
     [
         ({"matched": False}, {}, "no match found"),
         ({}, {}, "matched the wrong pose"),
@@ -129,9 +129,9 @@ def _attempt(**changes):
         ({}, {"right": True, "valid": False}, "invalid path"),
     ],
 )
-def test_causes(changes, max_scored, cause):
-    max_scored = {"right": False, "valid": True, "alike": False, "known": True} | max_scored
-    assert methods._cause(_attempt(**changes), **max_scored) == cause
+def test_causes(changes, judged, cause):
+    judged = {"right": False, "valid": True, "alike": False, "known": True} | judged
+    assert methods._cause(_attempt(**changes), **judged) == cause
     assert cause in methods.CAUSES
 
 

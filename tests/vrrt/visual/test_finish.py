@@ -89,7 +89,7 @@ def test_a_straight_way_that_only_the_spheres_refuse(slider, margin, granted):
         np.testing.assert_array_equal(way, ends)
 
 
-class NoPassage(type(vrrt_jax.build_world(vrrt_jax.load_robot("panda")))):
+class NoPassage(vrrt_jax.ClosedFormWorld):
     """A world where nobody passes x = 0, which no obstacle tells."""
 
     def is_free(self, q):
@@ -102,7 +102,10 @@ def test_a_straight_path_obeys_an_is_free_of_ones_own(slider):
     found = finished(trees.create(jnp.asarray(ends), jnp.zeros(2), None, 8))
     assert finish._straight(slider, world, found, *ends)[1] is not None
     fields = {field.name: getattr(world, field.name) for field in dataclasses.fields(world)}
-    assert finish._straight(slider, NoPassage(**fields), found, *ends)[1] is None
+    zone = NoPassage(**fields)
+    assert finish._straight(slider, zone, found, *ends)[1] is None
+    with pytest.raises(ValueError, match="the start is refused by NoPassage.is_free"):
+        vrrt_jax.plan_to_configuration(slider, zone, [0.0], [0.5], key=jax.random.key(0))
 
 
 def test_a_match_without_a_way_is_told(slider, monkeypatch):
