@@ -117,7 +117,7 @@ def plan(
     if not isinstance(goal, ImageGoal):
         check_goal(goal)
     start = checks.check_start(robot, world, start)
-    policy = _policy(planner, goal, config)
+    policy = _policy(planner, goal, world, config)
     roots = start[None]
     if q_guess is not None:
         roots = np.stack([start, checks.check_limits(robot, q_guess, "guess")])
@@ -160,7 +160,7 @@ def plan_to_configuration(
     config = PlannerConfig() if config is None else config
     if planner in ("rrt", "rrt-star"):
         make = RRT if planner == "rrt" else RRTStar
-        planner = make(goal_bias=goal_bias, lanes=config.tree.lanes)
+        planner = make.for_world(world, goal_bias=goal_bias, lanes=config.tree.lanes)
     goal = ConfigurationGoal(q=np.asarray(q_goal))
     run = {"key": key, "planner": planner, "config": config, "on_progress": on_progress}
     return plan(robot, world, goal, q_start, **run)
@@ -248,7 +248,7 @@ def plan_batch(
             problems.append(make_problem(robot, goal, starts[-1], config))
         except ValueError as error:
             raise ValueError(f"problem {i}: {error}") from None
-    policy = _policy(planner, goals[0], config)
+    policy = _policy(planner, goals[0], world, config)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(starts)))
     with interruptible():
         trees, compile_s, seed_s = zip(
@@ -409,7 +409,7 @@ def _termination(config: PlannerConfig, policy: ExpansionPolicy, goal: Goal) -> 
 
 
 def _policy(
-    planner: str | ExpansionPolicy | None, goal: AnyGoal, config: PlannerConfig
+    planner: str | ExpansionPolicy | None, goal: AnyGoal, world: World, config: PlannerConfig
 ) -> ExpansionPolicy:
     """The policy of a planner by name, or the object itself.
 
@@ -423,7 +423,7 @@ def _policy(
         check_policy(planner)
         return planner
     if planner == VISUAL:
-        return VisualRRT.from_config(config)
+        return VisualRRT.from_config(config, world)
     if planner not in PLANNERS:
         raise ValueError(f"unknown planner '{planner}'; have: {', '.join([*PLANNERS, VISUAL])}")
     if not has_configuration:
@@ -431,7 +431,7 @@ def _policy(
             f"planner '{planner}' needs a ConfigurationGoal, and the goal is a "
             f"{type(goal).__name__}; expected planner '{VISUAL}'"
         )
-    return PLANNERS[planner](lanes=config.tree.lanes)
+    return PLANNERS[planner].for_world(world, lanes=config.tree.lanes)
 
 
 def _image_goal(

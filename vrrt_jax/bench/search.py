@@ -32,7 +32,7 @@ def iteration_split(problem: Problem, repeats: int = 15) -> dict:
     """Times of the parts of one iteration on a grown tree, each jitted by itself [ms]."""
     config = PlannerConfig()
     visual = make_problem(problem.robot, problem.goal, problem.q_start, config)
-    policy, goal = VisualRRT.from_config(config), visual.goal
+    policy, goal = VisualRRT.from_config(config, problem.world), visual.goal
     world, key = problem.world, jax.random.key(0)
     roots = seeded_roots(world, visual.seeds, problem.q_start[None], key)
     found = search(

@@ -4,6 +4,7 @@ A world says what its edges are, so that the kernel serves straight lines, turni
 alike. An edge is a pytree of arrays that lead with the lanes; what is in it, only the world knows.
 """
 
+import math
 from typing import Any, Protocol
 
 import jax
@@ -193,6 +194,16 @@ def steer(
     step = jnp.where(world.is_continuous, step, inside)
     length = jnp.sqrt(jnp.sum(step**2, axis=-1, keepdims=True))
     return step * jnp.minimum(1.0, max_length / jnp.maximum(length, 1e-12))
+
+
+def num_checks(world: Space, max_step: float) -> int:
+    """How many sub-steps, each no longer than the world's resolution, an edge needs; on the host.
+
+    Args:
+        world: whose resolution it is.
+        max_step: longest edge, in the units of the resolution.
+    """
+    return max(1, math.ceil(max_step / float(world.resolution) - 1e-3))
 
 
 def free_prefix(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) -> jax.Array:

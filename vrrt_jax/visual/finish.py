@@ -247,7 +247,8 @@ def _connect(
 
     If time is up meanwhile, or the user interrupts, the search has stopped for that.
     """
-    goal, policy = ConfigurationGoal(q=jnp.asarray(q_goal)), RRTConnect(lanes=config.tree.lanes)
+    goal = ConfigurationGoal(q=jnp.asarray(q_goal))
+    policy = RRTConnect.for_world(world, lanes=config.tree.lanes)
     connection = search(
         world,
         goal,

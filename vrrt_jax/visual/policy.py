@@ -6,7 +6,7 @@ and the child inherits the moments; exploring lanes take a random step and start
 
 import dataclasses
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ import optax
 
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import difference
+from vrrt_jax.core.edges import difference, num_checks
 from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.rewire import rewire
 from vrrt_jax.core.types import Expansion, Goal, Proposals, Tree, pytree, static
@@ -50,6 +50,9 @@ class VisualRRT:
     of the same size or hyper-parameter never re-compiles.
     """
 
+    MAX_STEP: ClassVar[float] = 0.12  # [rad]
+    MAX_REWIRED_EDGE: ClassVar[float] = 0.3  # [rad]
+
     alpha: Any = 0.04  # () Adam step [rad]
     epsilon: Any = 0.04  # () exploration step [rad]
     kappa: Any = 0.9  # () decay of the frontier's geometric law
@@ -69,8 +72,8 @@ class VisualRRT:
     rewire_checks: int = static(default=8)
 
     @classmethod
-    def from_config(cls, config: PlannerConfig) -> "VisualRRT":
-        """The policy with the settings of a plan."""
+    def from_config(cls, config: PlannerConfig, world: World) -> "VisualRRT":
+        """The policy with the settings of a plan; its steps are as long in any world."""
         expand, tree = config.expand, config.tree
         numbers: dict[str, Any] = {
             name: jnp.asarray(value) for name, value in dataclasses.asdict(expand).items()
@@ -80,6 +83,8 @@ class VisualRRT:
             rewire_radius=jnp.float32(tree.rewire_radius),
             rewiring=tree.rewiring,
             lanes=tree.lanes,
+            edge_steps=num_checks(world, cls.MAX_STEP),
+            rewire_steps=num_checks(world, max(tree.rewire_radius, cls.MAX_REWIRED_EDGE)),
         )
 
     def init(

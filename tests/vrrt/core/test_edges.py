@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from core_cases import GOAL, START
 
+import vrrt_jax
 from vrrt_jax.core.edges import difference, free_prefix, normalize, steer
+from vrrt_jax.core.planners import PLANNERS
 
 
 def test_steering_respects_limits_length_and_wrapping(panda, wall_world):
@@ -31,3 +33,14 @@ def test_free_steps_counts_the_leading_free_ones(wall_world, free):
     edge = wall_world.edge(start, goal)
     count = jax.jit(free_prefix, static_argnums=3)(wall_world, start, edge, 64)
     assert int(count[0]) == int(np.argmin(is_free))
+
+
+def test_steps_are_as_long_in_a_world_with_finer_checks(panda, wall_world):
+    finer = dataclasses.replace(wall_world, resolution=wall_world.resolution / 3)
+    for planner in PLANNERS.values():
+        assert planner.for_world(wall_world).edge_steps == planner().edge_steps
+        assert planner.for_world(finer).edge_steps == 3 * planner().edge_steps
+    config = vrrt_jax.PlannerConfig()
+    coarse, fine = (vrrt_jax.VisualRRT.from_config(config, w) for w in (wall_world, finer))
+    assert (coarse.edge_steps, coarse.rewire_steps) == (6, 15)
+    assert (fine.edge_steps, fine.rewire_steps) == (18, 45)

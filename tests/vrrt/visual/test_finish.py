@@ -36,7 +36,7 @@ def test_ambiguous_goals_are_told(panda, self_model, camera, open_world):
     config = PlannerConfig().changed({"match.scale": 20.0, "polish.rounds": 1})
     problem = make_problem(panda, ImageGoal(self_model, camera, image), Q_START, config)
     roots = np.stack([Q_START, Q_GOAL, HALF_TURNED])
-    policy = VisualRRT.from_config(config)
+    policy = VisualRRT.from_config(config, open_world)
     found = finished(policy.init(open_world, problem.goal, roots, config.tree.capacity))
     args = (panda, open_world, problem, found, Q_START, jax.random.key(0), config)
     result = finish.finish_visual(*args)

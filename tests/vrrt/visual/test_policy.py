@@ -23,7 +23,7 @@ def goal(panda, self_model, camera, image):
 
 
 def grown(world, goal, iterations, **changes):
-    policy = dataclasses.replace(VisualRRT.from_config(CONFIG), **changes)
+    policy = dataclasses.replace(VisualRRT.from_config(CONFIG, world), **changes)
     tree = policy.init(world, goal, Q_START[None], 1024)
     step = jax.jit(expand)
     for _ in range(iterations):

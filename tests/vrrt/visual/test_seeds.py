@@ -19,7 +19,7 @@ def test_seeds_are_free_near_and_look_alike_and_evolve(
         config = QUICK.changed({"seeds.steps": 0, "seeds.rounds": rounds})
         problem = make_problem(panda, goal, Q_START, config)
         q_roots = seeded_roots(wall_world, problem.seeds, Q_START[None], jax.random.key(0))
-        policy = VisualRRT.from_config(config)
+        policy = VisualRRT.from_config(config, wall_world)
         tree = policy.init(wall_world, problem.goal, q_roots, config.tree.capacity)
         assert np.all(np.asarray(tree.cost[1:64]) == UNREACHED) and float(tree.cost[0]) == 0
         roots = np.asarray(tree.q[1 : int(tree.size)])

@@ -1,13 +1,13 @@
 """RRT, with every sub-step as a node if asked for (RRT-IS)."""
 
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import Space
+from vrrt_jax.core.edges import Space, num_checks
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.types import Expansion, Proposals, PytreeSubclasses, Tree, pytree, static
 
@@ -23,8 +23,11 @@ def sample_configurations(world: Space, key: jax.Array, num: int) -> jax.Array:
 class RRT(PytreeSubclasses):
     """Single-tree RRT (LaValle 1998): extend the nearest node towards a random configuration.
 
-    A node's score is its distance to the goal.
+    A node's score is its distance to the goal. The longest step is ``edge_steps`` times the world's
+    resolution; :meth:`for_world` chooses ``edge_steps`` for steps of :data:`MAX_STEP`.
     """
+
+    MAX_STEP: ClassVar[float] = 0.64  # [rad]
 
     goal_bias: Any = 0.1  # () share of lanes that aim at the goal
     keep_partial: bool = static(default=False)  # keep the free part of a blocked edge
@@ -32,6 +35,11 @@ class RRT(PytreeSubclasses):
     intermediate: bool = static(default=False)
     lanes: int = static(default=32)
     edge_steps: int = static(default=32)
+
+    @classmethod
+    def for_world(cls, world: Space, **settings: Any) -> Self:
+        """The planner with steps of the same length, however fine the world's checks are."""
+        return cls(edge_steps=num_checks(world, cls.MAX_STEP), **settings)
 
     def init(self, world: Space, goal: ConfigurationGoal, q_roots: Any, capacity: int) -> Tree:
         """A tree of the start, and a forest if there are other roots."""

@@ -1,14 +1,14 @@
 """RRT-Connect: two trees that grow towards each other."""
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import Space, distance
+from vrrt_jax.core.edges import Space, distance, num_checks
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
@@ -44,9 +44,16 @@ class RRTConnect:
     A node that arrives scores 0.
     """
 
+    MAX_STEP: ClassVar[float] = 0.64  # [rad]
+
     margin: Any = 1.0  # how far from the ends half of the samples are drawn [rad]
     lanes: int = static(default=32)
     edge_steps: int = static(default=32)
+
+    @classmethod
+    def for_world(cls, world: Space, **settings: Any) -> Self:
+        """The planner with steps of the same length, however fine the world's checks are."""
+        return cls(edge_steps=num_checks(world, cls.MAX_STEP), **settings)
 
     def init(
         self, world: Space, goal: ConfigurationGoal, q_roots: Any, capacity: int

@@ -1,10 +1,10 @@
 """RRT*: RRT whose tree is rewired, so that paths get shorter as long as it runs."""
 
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import jax
 
-from vrrt_jax.core.edges import Space
+from vrrt_jax.core.edges import Space, num_checks
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners.rrt import RRT
 from vrrt_jax.core.rewire import rewire
@@ -15,9 +15,17 @@ from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
 class RRTStar(RRT):
     """RRT* (Karaman and Frazzoli 2011). It goes on to improve until its budget ends."""
 
+    MAX_REWIRED_EDGE: ClassVar[float] = 1.92  # [rad] longest edge that rewiring checks
+
     # Nodes of a sparse tree in seven dimensions lie that far apart.
     rewire_radius: Any = 1.9  # () [rad]
     rewire_steps: int = static(default=96)  # sub-steps of an edge that rewiring checks
+
+    @classmethod
+    def for_world(cls, world: Space, **settings: Any) -> Self:
+        """See :meth:`RRT.for_world`."""
+        rewire_steps = num_checks(world, cls.MAX_REWIRED_EDGE)
+        return super().for_world(world, rewire_steps=rewire_steps, **settings)
 
     def goal_score(self, goal: ConfigurationGoal) -> float:
         """None: a path can always be shorter."""
