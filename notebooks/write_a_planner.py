@@ -54,7 +54,7 @@ class ExpansiveSpaceTree:
 
     def extract_path(self, tree):
         """The path (P, D) to the node nearest to the goal."""
-        return trees.branch_path(tree)
+        return trees.best_path(tree)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from vrrt_jax.core.settings import check_settings, setting
+from vrrt_jax.core.settings import setting
 
 EDGE_STEPS = 64  # collision checks along an edge of a single tree (static)
 
@@ -17,13 +17,3 @@ class PlannerConfig:
     capacity: int = setting(8192, 3)  # most nodes of the tree
     max_expansions: int = setting(32_000, 1)  # budget; one iteration of all lanes is the least
     time_limit_s: float = setting(60.0, 0.0)  # wall time of the search [s]
-
-
-def check_config(config: PlannerConfig) -> None:
-    """Raise a ValueError that names the setting out of range."""
-    check_settings(config)
-    if config.capacity < config.lanes + 2:
-        raise ValueError(
-            f"capacity is {config.capacity}; expected at least {config.lanes + 2}, two more than "
-            "the lanes: raise it or lower lanes"
-        )

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nrp_jax.config import EDGE_STEPS, PlannerConfig, check_config
+from nrp_jax.config import EDGE_STEPS, PlannerConfig
 from nrp_jax.homes.grid import Grid
 from nrp_jax.planners.nrp import NeuralRRT
 from nrp_jax.samplers import check_fits, load_sampler
@@ -23,7 +23,8 @@ from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.planners import RRT, RRTConnect
 from vrrt_jax.core.postprocess import CheckedPath, plan_result, postprocess, unchecked
 from vrrt_jax.core.result import STATUS_OF, PlanResult, Status
-from vrrt_jax.core.search import SearchResult, StopReason, make_termination, search
+from vrrt_jax.core.search import SearchResult, make_termination, search
+from vrrt_jax.core.settings import check_settings
 from vrrt_jax.core.shortcut import padded
 from vrrt_jax.core.types import ExpansionPolicy
 
@@ -32,6 +33,7 @@ KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae"}  # of the samplers that plan
 ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
 ADVICE = {
     Status.SOLVED: "",
+    Status.NO_MATCH: "raise max_expansions",
     Status.NO_PATH: "raise max_expansions",
     Status.MAX_ITERATIONS: "raise max_expansions",
     Status.TREE_FULL: "raise capacity",
@@ -84,12 +86,17 @@ def plan(
         ValueError: an input makes no sense; the message says what to do.
     """
     config = _config(config, settings)
-    planner = planner if method is None else method
+    planner = _planner(planner, method)
     world = build_world(robot, grid) if world is None else world
     start = check_configuration(robot, world, q_start, "start")
-    end = q_goal.q if isinstance(q_goal, ConfigurationGoal) else q_goal
-    goal = ConfigurationGoal(q=check_configuration(robot, world, end, "goal"))
+    goal = q_goal if isinstance(q_goal, ConfigurationGoal) else ConfigurationGoal(q=q_goal)
+    goal = dataclasses.replace(goal, q=check_configuration(robot, world, goal.q, "goal"))
     policy = _policy(planner, robot, world, sampler, config)
+    if config.capacity < policy.lanes + 2:
+        raise ValueError(
+            f"capacity is {config.capacity}; expected at least {policy.lanes + 2}, two more than "
+            "the lanes: raise it or lower lanes"
+        )
     tree = policy.init(world, goal, np.asarray(start)[None], config.capacity)
     scene = scene or ExactScene(robot, grid)
     tried, spent, rejected = 0, Counter(), Counter()
@@ -124,6 +131,23 @@ def plan(
     )
 
 
+def _planner(planner: str | ExpansionPolicy, method: str | None) -> str | ExpansionPolicy:
+    """The planner that is asked for.
+
+    Raises:
+        ValueError: two are, the name is unknown, or the object is no policy.
+    """
+    if method is not None:
+        if planner != "rrt-connect":
+            raise ValueError("got both planner and method; expected one of them")
+        planner = method
+    if not isinstance(planner, str):
+        check_policy(planner)
+    elif planner not in PLANNERS:
+        raise ValueError(f"unknown planner '{planner}'; have: {', '.join(PLANNERS)}")
+    return planner
+
+
 def _config(config: PlannerConfig | None, settings: dict[str, Any]) -> PlannerConfig:
     """The settings of a plan, those given by name included."""
     config = PlannerConfig() if config is None else config
@@ -131,7 +155,7 @@ def _config(config: PlannerConfig | None, settings: dict[str, Any]) -> PlannerCo
     if unknown := sorted({*settings} - {*known}):
         raise ValueError(f"unknown settings {', '.join(unknown)}; have: {', '.join(known)}")
     config = dataclasses.replace(config, **settings)
-    check_config(config)
+    check_settings(config)
     return config
 
 
@@ -203,13 +227,10 @@ def _policy(
     """The policy of a planner by name, or the object itself.
 
     Raises:
-        ValueError: the name is unknown, the object is no policy, or the sampler does not fit.
+        ValueError: the sampler does not fit.
     """
     if not isinstance(planner, str):
-        check_policy(planner)
         return planner
-    if planner not in PLANNERS:
-        raise ValueError(f"unknown planner '{planner}'; have: {', '.join(PLANNERS)}")
     if planner == "rrt-connect":
         return RRTConnect(lanes=max(config.lanes, 2))
     bias = jnp.float32(config.goal_bias)
@@ -232,9 +253,9 @@ def _finish(
     key: jax.Array,
 ) -> PlanResult:
     """Shorten and verify what a search found."""
-    raw = policy.extract_path(found.tree)
-    reached = raw is not None and found.stopped is StopReason.REACHED
-    raw = np.asarray(start)[None] if raw is None else raw
+    path = policy.extract_path(found.tree)
+    raw = np.asarray(start)[None] if path is None else path
+    reached = float(goal.loss(world, jnp.asarray(raw[-1]))) <= float(goal.threshold)
 
     def check(path: np.ndarray) -> CheckedPath:
         trajectory = trajectory_of(world, path)
@@ -258,5 +279,4 @@ def _finish(
         target=np.asarray(goal.q),
         loss=float(goal.loss(world, jnp.asarray(done.checked.path[-1]))),
         match_threshold=float(goal.threshold),
-        lanes=policy.lanes,
     )

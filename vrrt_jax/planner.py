@@ -1,7 +1,7 @@
 """Planning, from the outside: what users call, with every input checked on the host."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, overload
 
 import jax
@@ -9,32 +9,29 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax import checks
+from vrrt_jax.attempts import Progress, plan_by_loss, seeded_tree, termination_of
 from vrrt_jax.config import PlannerConfig, check_config
 from vrrt_jax.core.check_protocols import check_goal, check_policy
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.planners import PLANNERS, RRT, RRTStar
-from vrrt_jax.core.result import ABORTED, STATUS_OF, PlanResult, Status, with_time_of
+from vrrt_jax.core.result import STATUS_OF, PlanResult, Status
 from vrrt_jax.core.search import make_termination, search
-from vrrt_jax.core.timing import timed
-from vrrt_jax.core.types import ExpansionPolicy, Goal, Tree
+from vrrt_jax.core.types import ExpansionPolicy, Goal
+from vrrt_jax.outcome import JOINT_ADVICE, Chosen, finish, time_left
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.world import World
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera
-from vrrt_jax.visual.finish import ADVICE, Chosen, finish, finish_visual, time_left
+from vrrt_jax.visual.finish import finish_visual
 from vrrt_jax.visual.goal import ImageGoal
-from vrrt_jax.visual.policy import VisualRRT, init_forest
+from vrrt_jax.visual.policy import VisualRRT
 from vrrt_jax.visual.problem import VisualProblem, make_problem
-from vrrt_jax.visual.seeds import sample_seeds, seeded_roots
 
-SEED_KEY = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
-RETRYABLE = (Status.NO_MATCH, Status.NO_PATH, Status.NOT_VERIFIED)  # worth another attempt
 VISUAL = "visual-rrt"
 
 Image = np.ndarray | Sequence[np.ndarray]
 AnyGoal = ImageGoal | ConfigurationGoal | Goal
-Progress = Callable[..., Any] | None
 
 
 @overload
@@ -120,13 +117,15 @@ def plan(
     policy = _policy(planner, goal, world, config)
     roots = start[None]
     if q_guess is not None:
+        if isinstance(goal, ConfigurationGoal):
+            raise ValueError("q_guess is for goals that are not known; drop it for a joint goal")
         roots = np.stack([start, checks.check_limits(robot, q_guess, "guess")])
     if isinstance(goal, ConfigurationGoal):
         q_goal = checks.check_start(robot, world, goal.q, what="goal")
         goal = dataclasses.replace(goal, q=jnp.asarray(q_goal))
         return _plan_to_configuration(robot, world, goal, policy, roots, key, config, on_progress)
     problem = make_problem(robot, goal, start, config)
-    return _plan_by_loss(robot, world, problem, policy, roots, key, config, on_progress)
+    return plan_by_loss(robot, world, problem, policy, roots, key, config, on_progress)
 
 
 def plan_to_configuration(
@@ -242,6 +241,11 @@ def plan_batch(
     problems: list[VisualProblem] = []
     for i, (goal, q_start) in enumerate(zip(goals, all_starts, strict=True)):
         try:
+            if isinstance(goal, ConfigurationGoal):
+                raise ValueError(
+                    "a batch searches by loss, and the goal is a ConfigurationGoal; expected image "
+                    "goals, or call plan for each joint goal"
+                )
             if not isinstance(goal, ImageGoal):
                 check_goal(goal)
             starts.append(checks.check_start(robot, world, q_start))
@@ -253,12 +257,12 @@ def plan_batch(
     with interruptible():
         trees, compile_s, seed_s = zip(
             *(
-                _seeded_tree(world, problem, policy, q_start[None], own_key, config)
+                seeded_tree(world, problem, policy, q_start[None], own_key, config)
                 for problem, q_start, own_key in zip(problems, starts, keys, strict=True)
             ),
             strict=True,
         )
-        terminations = [_termination(config, policy, problem.goal) for problem in problems]
+        terminations = [termination_of(config, policy, problem.goal) for problem in problems]
         found = search(
             world,
             _stack([problem.goal for problem in problems]),
@@ -315,97 +319,10 @@ def _plan_to_configuration(
         threshold=float(goal.threshold),
     )
     result = finish(robot, world, found, chosen, roots[0], key, config)
+    status = result.status
     if path is None:
         status = STATUS_OF.get(found.stopped, Status.NO_PATH)
-        result = dataclasses.replace(result, status=status, advice=ADVICE[status])
-    return result
-
-
-def _plan_by_loss(
-    robot: Robot,
-    world: World,
-    problem: VisualProblem,
-    policy: ExpansionPolicy,
-    roots: np.ndarray,
-    key: jax.Array,
-    config: PlannerConfig,
-    on_progress: Progress,
-) -> PlanResult:
-    """Attempts from different seeds, until one is solved; the best of them."""
-    with interruptible():
-        result = _attempt(robot, world, problem, policy, roots, key, config, on_progress)
-        for again in range(1, config.budget.attempts):
-            rest = time_left(config, result.timing["search_s"])
-            if result.status not in RETRYABLE or rest.budget.time_limit_s == 0:
-                break
-            key = jax.random.fold_in(key, SEED_KEY - again)
-            other = _attempt(robot, world, problem, policy, roots, key, rest, on_progress)
-            if other.status in ABORTED and not other.ok:
-                # It ended before its loss could be compared with the other's.
-                best = dataclasses.replace(result, status=other.status, advice=other.advice)
-            else:
-                best = min(result, other, key=lambda r: (not r.ok, r.loss))
-            result = with_time_of(best, result, other)
-    return result
-
-
-def _attempt(
-    robot: Robot,
-    world: World,
-    problem: VisualProblem,
-    policy: ExpansionPolicy,
-    roots: np.ndarray,
-    key: jax.Array,
-    config: PlannerConfig,
-    on_progress: Progress,
-) -> PlanResult:
-    """Sample seeds around the start (the first of the roots), search and finish, once."""
-    tree, compile_s, seed_s = _seeded_tree(world, problem, policy, roots, key, config)
-    found = search(
-        world,
-        problem.goal,
-        policy,
-        tree,
-        key=key,
-        termination=_termination(config, policy, problem.goal),
-        time_limit_s=time_left(config, seed_s).budget.time_limit_s,
-        on_progress=on_progress,
-    )
-    found = dataclasses.replace(
-        found, compile_s=found.compile_s + compile_s, search_s=found.search_s + seed_s
-    )
-    return finish_visual(robot, world, problem, found, roots[0], key, config)
-
-
-def _seeded_tree(
-    world: World,
-    problem: VisualProblem,
-    policy: ExpansionPolicy,
-    roots: np.ndarray,
-    key: jax.Array,
-    config: PlannerConfig,
-) -> tuple[Tree, float, float]:
-    """The forest before the search, and the seconds for its compilation and for itself."""
-    key = jax.random.fold_in(key, SEED_KEY)
-
-    def grow() -> Tree:
-        all_roots = seeded_roots(world, problem.seeds, roots, key)
-        return policy.init(world, problem.goal, all_roots, config.tree.capacity)
-
-    return timed(grow, sample_seeds, init_forest)
-
-
-def _termination(config: PlannerConfig, policy: ExpansionPolicy, goal: Goal) -> Any:
-    """When a search by loss ends."""
-    budget = config.budget
-    return make_termination(
-        policy.goal_score(goal),
-        settle_iterations=budget.settle_iterations,
-        max_iterations=budget.max_iterations,
-        patience=budget.patience,
-        min_improvement=budget.min_improvement,
-        min_ratio=budget.min_ratio,
-    )
+    return dataclasses.replace(result, status=status, advice=JOINT_ADVICE[status])
 
 
 def _policy(
@@ -421,17 +338,23 @@ def _policy(
         planner = "rrt-connect" if has_configuration else VISUAL
     if not isinstance(planner, str):
         check_policy(planner)
+        if isinstance(planner, tuple(PLANNERS.values())) and not has_configuration:
+            raise ValueError(_needs_configuration(type(planner).__name__, goal))
         return planner
     if planner == VISUAL:
         return VisualRRT.from_config(config, world)
     if planner not in PLANNERS:
         raise ValueError(f"unknown planner '{planner}'; have: {', '.join([*PLANNERS, VISUAL])}")
     if not has_configuration:
-        raise ValueError(
-            f"planner '{planner}' needs a ConfigurationGoal, and the goal is a "
-            f"{type(goal).__name__}; expected planner '{VISUAL}'"
-        )
+        raise ValueError(_needs_configuration(planner, goal))
     return PLANNERS[planner].for_world(world, lanes=config.tree.lanes)
+
+
+def _needs_configuration(planner: str, goal: AnyGoal) -> str:
+    return (
+        f"planner '{planner}' needs a ConfigurationGoal, and the goal is a "
+        f"{type(goal).__name__}; expected planner '{VISUAL}'"
+    )
 
 
 def _image_goal(

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-import vrrt_jax
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.edges import joint_error
 from vrrt_jax.core.files import replacing
@@ -58,9 +57,9 @@ def summary(
 
 def versions() -> dict[str, str]:
     """Versions of what the result depends on."""
-    names = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "optax", "numpy")
+    names = ("vrrt-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "optax", "numpy")
     found = {name: metadata.version(name) for name in names}
-    return {"vrrt-jax": vrrt_jax.__version__, "python": platform.python_version(), **found}
+    return {"python": platform.python_version(), **found}
 
 
 def save_result(

@@ -15,6 +15,7 @@ from nrp_jax.bench import planning
 from nrp_jax.cli import main
 from nrp_jax.planner import Status, plan, trajectory_of
 from nrp_jax.scene.exact import ExactScene, Verification, verify
+from vrrt_jax.core.planners import RRTStar
 from vrrt_jax.core.shortcut import shortcut
 from vrrt_jax.core.types import pytree
 
@@ -299,3 +300,19 @@ def test_bench_counts_verified_plans(snake, home, scene, tmp_path, monkeypatch, 
     assert json.loads(out.read_text())["methods"]["rrt-connect"]["success"] == 0.0
     assert main([*command, "--methods", "bit-star"]) == 2
     assert "unknown method 'bit-star'; have: rrt, rrt-is" in capsys.readouterr().err
+
+
+def test_an_optimal_planner_and_a_goal_of_ones_own(snake, home, scene):
+    """RRT* ends by its budget, and a goal keeps its own threshold."""
+    near = START.copy()
+    near[0] += 0.4
+    goal = nrp_jax.ConfigurationGoal(q=near, threshold=0.05)
+    planner = RRTStar(goal_bias=0.3, keep_partial=True, edge_steps=64, lanes=8)
+    run: dict = {"key": jax.random.key(0), "scene": scene}
+    result = plan(snake, home, START, goal, planner=planner, max_expansions=80, **run)
+    assert result.ok and result.match_threshold == 0.05
+    assert result.expansions == 80
+    with pytest.raises(ValueError, match="got both planner and method"):
+        plan(snake, home, START, near, planner="rrt", method="nrp-d", **run)
+    with pytest.raises(ValueError, match="capacity is 20; expected at least 34"):
+        plan(snake, home, START, near, capacity=20, **run)

@@ -10,7 +10,8 @@ import pytest
 from pictures import Q_GOAL, Q_START, QUICK, picture
 
 import vrrt_jax
-from vrrt_jax import ImageGoal, PlannerConfig, planner
+from vrrt_jax import ImageGoal, PlannerConfig
+from vrrt_jax import attempts as attempts_module
 from vrrt_jax.core import search as searches
 from vrrt_jax.core.result import with_time_of
 
@@ -149,7 +150,7 @@ def test_another_attempt_while_nothing_matches(
 
     ended = dataclasses.replace(results[1], status=vrrt_jax.Status.INTERRUPTED, loss=0.0)
     attempts = iter([results[0], ended])  # whose losses are of other images
-    monkeypatch.setattr(planner, "_attempt", lambda *_: next(attempts))
+    monkeypatch.setattr(attempts_module, "attempt", lambda *_: next(attempts))
     result = vrrt_jax.plan(*args, key=jax.random.key(0), config=config)
     assert result.status is vrrt_jax.Status.INTERRUPTED and result.loss == results[0].loss
 
@@ -231,3 +232,30 @@ def test_what_is_no_goal_and_what_is_no_planner_is_refused(panda, open_world):
         vrrt_jax.plan(panda, open_world, goal, Q_START, key=key, planner=vrrt_jax.RRT)
     with pytest.raises(ValueError, match="the planner object lacks edge_steps, lanes, init"):
         vrrt_jax.plan(panda, open_world, goal, Q_START, key=key, planner=object())
+
+
+def test_a_batch_of_joint_goals_is_refused(panda, open_world):
+    goals = [vrrt_jax.ConfigurationGoal(q=Q_GOAL)] * 2
+    starts = np.stack([Q_START] * 2)
+    with pytest.raises(ValueError, match="problem 0: a batch searches by loss"):
+        vrrt_jax.plan_batch(panda, open_world, goals, starts, key=jax.random.key(0))
+
+
+def test_what_does_not_go_with_a_goal_is_refused(panda, open_world, self_model, camera, image):
+    key, goal = jax.random.key(0), vrrt_jax.ConfigurationGoal(q=Q_GOAL)
+    with pytest.raises(ValueError, match="q_guess is for goals that are not known"):
+        vrrt_jax.plan(panda, open_world, goal, Q_START, key=key, q_guess=Q_GOAL)
+    image_goal = ImageGoal(self_model, camera, image)
+    with pytest.raises(ValueError, match="'RRT' needs a ConfigurationGoal, and the goal"):
+        vrrt_jax.plan(panda, open_world, image_goal, Q_START, key=key, planner=vrrt_jax.RRT())
+    planner = vrrt_jax.RRTStar(intermediate=True)
+    with pytest.raises(ValueError, match="keeps no sub-steps as nodes"):
+        vrrt_jax.plan(panda, open_world, goal, Q_START, key=key, planner=planner)
+
+
+def test_expansions_count_the_planners_own_lanes(panda, open_world):
+    result = vrrt_jax.plan_to_configuration(
+        panda, open_world, Q_START, Q_GOAL, key=jax.random.key(0), planner=vrrt_jax.RRT(lanes=8)
+    )
+    assert result.expansions == 8 * result.iterations > 0
+    assert f"{result.expansions} expansions" in str(result)

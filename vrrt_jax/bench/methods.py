@@ -60,7 +60,7 @@ class Attempt:
     """What a method came back with."""
 
     path: np.ndarray  # (P, D)
-    matched: bool  # the image of its end is within the bar
+    matched: bool  # the image of its end is below the match threshold
     has_path: bool  # False if a goal was found, but no way to it
     out_of_time: bool
     loss: float

@@ -20,8 +20,8 @@ PAPER_NOTE = (
     "The paper's numbers are its own: other worlds, tasks and self-models, 100 tasks a level, on "
     "an NVIDIA RTX 4090; 21.6 s a plan for the Panda."
 )
-CAUSE_COLOURS = ("#4878a8", "#d9903d", "#ecc68f", "#8a8a8a", "#c4c4c4", "#7a5aa6", "#b5433f")
-SOLVED_COLOUR = "#8fbc8f"
+CAUSE_COLORS = ("#4878a8", "#d9903d", "#ecc68f", "#8a8a8a", "#c4c4c4", "#7a5aa6", "#b5433f")
+SOLVED_COLOR = "#8fbc8f"
 
 
 def to_text(results: dict[str, Any]) -> str:
@@ -211,7 +211,7 @@ def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
             stacks.append(_cause_shares(levels))
             spent = sorted(row["time_s"] for row in rows)
             times.step(spent, 100 * np.arange(1, len(spent) + 1) / len(spent), label=name)
-    _stack_bars(causes, labels, stacks, CAUSES, CAUSE_COLOURS)
+    _stack_bars(causes, labels, stacks, CAUSES, CAUSE_COLORS)
     by_level.set(xlabel="distance from start to goal [rad]", ylabel="success [%]", ylim=(0, 102))
     causes.set(xlabel="failed tasks [%]", xlim=(0, 100))
     times.set(
@@ -244,7 +244,7 @@ def _ablation_figure(group: Sequence[dict[str, Any]], path: Path) -> None:
             labels.append(f"{base}, {name} (n = {sum(v['n'] for v in summary['levels'])})")
             stacks.append([100 - sum(shares), *shares])
     figure, axis = plt.subplots(figsize=(10, 1.5 + 0.24 * len(labels)), layout="constrained")
-    _stack_bars(axis, labels, stacks, ("solved", *CAUSES), (SOLVED_COLOUR, *CAUSE_COLOURS))
+    _stack_bars(axis, labels, stacks, ("solved", *CAUSES), (SOLVED_COLOR, *CAUSE_COLORS))
     axis.set(xlabel="tasks [%]", xlim=(0, 100))
     axis.margins(y=0.01)
     figure.legend(fontsize="small", ncols=4, loc="outside lower center")

@@ -16,7 +16,7 @@ KINDS = ("box", "sphere", "capsule", "cylinder")
 SIZE = (0.06, 0.14)  # [m] radii and half edges
 LENGTH = (0.15, 0.35)  # [m] half lengths of capsules and cylinders
 SHELL = (0.25, 0.85)  # distance of centers from the workspace's, in its radii
-COLOURS = ((0.30, 0.50, 0.75), (0.85, 0.65, 0.25), (0.85, 0.45, 0.30), (0.45, 0.65, 0.45))
+COLORS = ((0.30, 0.50, 0.75), (0.85, 0.65, 0.25), (0.85, 0.45, 0.30), (0.45, 0.65, 0.45))
 MOST_DRAWS = 1000  # of an obstacle
 
 
@@ -76,7 +76,7 @@ def _random_obstacle(
         position=_rounded(position),
         quaternion=_rounded(turn / np.linalg.norm(turn)),
         size=_rounded(size),
-        rgba=(*COLOURS[index % len(COLOURS)], 1.0),
+        rgba=(*COLORS[index % len(COLORS)], 1.0),
     )
 
 

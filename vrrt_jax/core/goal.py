@@ -1,5 +1,6 @@
 """Goals that the kernel knows, and the base of those that are fitted by least squares."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -30,56 +31,72 @@ class ConfigurationGoal:
 class LeastSquaresGoal(PytreeSubclasses):
     """Base of goals whose loss is a sum of squares: ``loss = sum(residual ** 2)``.
 
-    A subclass overrides ``loss`` or ``residual`` and gets the other. Gradients descend on the
-    loss, Levenberg-Marquardt on the residual, so that both see what was overridden.
+    A subclass overrides ``loss`` or ``residual`` and gets the other; one that overrides both keeps
+    them so. Gradients descend on the loss, Levenberg-Marquardt on the residual, so that both see
+    what was overridden.
 
     A residual that is a prediction less a target may override these two instead: differences of
     predictions keep the low bits that a subtraction of the target would cost.
     """
 
+    threshold: Any  # () the goal is reached by configurations whose loss is at most this
+
     def __init_subclass__(cls, **kwargs: Any):
-        """Derive what a subclass leaves out."""
+        """Derive what a subclass leaves out, from what this very class defines."""
         super().__init_subclass__(**kwargs)
         own = vars(cls)
-        if "prediction" in own:
-            cls.residual = own.get("residual", _prediction_less_target)
+        if "prediction" in own and "residual" not in own:
+            cls.residual = _residual_from_prediction(own["prediction"])
         elif "residual" in own:
             cls.prediction, cls.target = own["residual"], _no_target
         elif "loss" in own:
-            cls.prediction, cls.target = _root_of_loss, _no_target
-            cls.residual = _root_of_loss
-        if "loss" not in own and cls.residual is not LeastSquaresGoal.residual:
-            cls.loss = own.get("loss", _sum_of_squares)
+            cls.residual = cls.prediction = _residual_from_loss(own["loss"])
+            cls.target = _no_target
+        if "loss" not in own and ("residual" in own or "prediction" in own):
+            cls.loss = _loss_from_residual(cls.residual)
 
     def loss(self, world: Any, q: jax.Array) -> jax.Array:
         """How far a configuration (D,) is from the goal, ()."""
-        raise NotImplementedError("a goal overrides loss or residual")
+        raise NotImplementedError(_NEITHER)
 
     def residual(self, world: Any, q: jax.Array) -> jax.Array:
         """Errors (M,) of a configuration (D,)."""
-        raise NotImplementedError("a goal overrides loss or residual")
+        raise NotImplementedError(_NEITHER)
 
     def prediction(self, world: Any, q: jax.Array) -> jax.Array:
         """What a configuration (D,) looks like to the goal, (M,)."""
-        raise NotImplementedError("a goal overrides loss or residual")
+        raise NotImplementedError(_NEITHER)
 
     def target(self) -> jax.Array:
         """What it should look like, (M,)."""
-        raise NotImplementedError("a goal overrides loss or residual")
+        raise NotImplementedError(_NEITHER)
 
 
-def _prediction_less_target(self: LeastSquaresGoal, world: Any, q: jax.Array) -> jax.Array:
-    return self.prediction(world, q) - self.target()
+_NEITHER = "a goal overrides loss or residual"
 
 
-def _no_target(self: LeastSquaresGoal) -> jax.Array:
+# What is derived calls the function of the class that it was derived from, never that of ``self``:
+# a subclass may call ``super()`` from either method without going round in circles.
+def _residual_from_prediction(prediction: Callable) -> Callable:
+    def residual(self: Any, world: Any, q: jax.Array) -> jax.Array:
+        return prediction(self, world, q) - self.target()
+
+    return residual
+
+
+def _residual_from_loss(loss: Callable) -> Callable:
+    def residual(self: Any, world: Any, q: jax.Array) -> jax.Array:
+        return jnp.sqrt(jnp.maximum(loss(self, world, q), 1e-20))[None]
+
+    return residual
+
+
+def _loss_from_residual(residual: Callable) -> Callable:
+    def loss(self: Any, world: Any, q: jax.Array) -> jax.Array:
+        return jnp.sum(residual(self, world, q) ** 2)
+
+    return loss
+
+
+def _no_target(self: Any) -> jax.Array:
     return jnp.zeros(())
-
-
-def _root_of_loss(self: LeastSquaresGoal, world: Any, q: jax.Array) -> jax.Array:
-    """One error (1,) whose square is the loss."""
-    return jnp.sqrt(jnp.maximum(self.loss(world, q), 1e-20))[None]
-
-
-def _sum_of_squares(self: LeastSquaresGoal, world: Any, q: jax.Array) -> jax.Array:
-    return jnp.sum(self.residual(world, q) ** 2)

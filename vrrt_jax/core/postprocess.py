@@ -62,23 +62,22 @@ def postprocess(
         key: random key.
         rounds: of shortcutting.
     """
-    clock = [time.perf_counter()]
+    begun_s = time.perf_counter()
     shortcut(world, raw_path, key=key, rounds=0)  # compiles, if anything has to
-    clock.append(time.perf_counter())
+    compiled_s = time.perf_counter()
     short_path = shortcut(world, raw_path, key=key, rounds=rounds)
-    clock.append(time.perf_counter())
+    shortened_s = time.perf_counter()
     checked = check(short_path)
     if checked.verification is not None and not checked.verification.ok:
         raw = check(raw_path)
         checked = raw if raw.verification is not None and raw.verification.ok else checked
-    clock.append(time.perf_counter())
-    compile_s, shortcut_s, verify_s = np.diff(clock).tolist()
+    verified_s = time.perf_counter()
     return Postprocessed(
         raw_path=raw_path,
         checked=checked,
-        compile_s=compile_s,
-        shortcut_s=shortcut_s,
-        verify_s=verify_s,
+        compile_s=compiled_s - begun_s,
+        shortcut_s=shortened_s - compiled_s,
+        verify_s=verified_s - shortened_s,
     )
 
 
@@ -92,7 +91,6 @@ def plan_result(
     target: np.ndarray,
     loss: float,
     match_threshold: float,
-    lanes: int,
 ) -> PlanResult:
     """The result of a search and of what was made of its path.
 
@@ -105,7 +103,6 @@ def plan_result(
         target: (D,) what was planned to.
         loss: of the target.
         match_threshold: at or below which the loss counts as matched.
-        lanes: expansions an iteration.
     """
     path, iterations = done.checked.path, int(found.tree.iteration)
     return PlanResult(
@@ -123,7 +120,7 @@ def plan_result(
         verification=done.checked.verification,
         rejected=rejected_lanes(found),
         iterations=iterations,
-        expansions=iterations * lanes,
+        expansions=iterations * found.lanes,
         timing={
             "compile_s": found.compile_s + done.compile_s,
             "search_s": found.search_s,

@@ -68,7 +68,9 @@ class PlanResult:
     iterations: int
     expansions: int  # lanes tried
     timing: Mapping[str, float]  # compile_s, search_s, shortcut_s, verify_s
-    history: np.ndarray  # (chunks + 1, 4): iteration, seconds, best score, nodes
+    # (chunks + 1, 4): iteration, seconds, best score (of RRT-Connect: the distance between its
+    # trees), nodes
+    history: np.ndarray
     tree: Tree
 
     @property
@@ -88,7 +90,8 @@ class PlanResult:
         ambiguous = f"; ambiguous: {others} other configurations match as well" if others else ""
         return (
             f"{self.status.name}: loss {self.loss:.2e} (goal {self.match_threshold:.2e}), "
-            f"{len(self.path)} waypoints, cost {self.cost:.2f}, {self.iterations} iterations; "
+            f"{len(self.path)} waypoints, cost {self.cost:.2f}, {self.expansions} expansions, "
+            f"{int(self.tree.size)} nodes; "
             f"{times}{ambiguous}"
         )
 

@@ -16,7 +16,7 @@ from vrrt_jax.core.expand import expand
 from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.types import ExpansionPolicy, Tree, pytree
 
-CHUNK = 8  # iterations between two looks at the clock
+CHUNK = 8  # iterations between two checks of the clock
 
 
 class StopReason(enum.IntEnum):
@@ -61,6 +61,7 @@ class SearchResult:
     history: np.ndarray  # (chunks + 1, 4): iteration, seconds, best score, nodes
     compile_s: float
     search_s: float
+    lanes: int = 32  # expansions an iteration
     stopped_each: tuple[StopReason, ...] = ()  # of the problems of a batch
 
 
@@ -197,6 +198,7 @@ def search(
         stopped_each=each,
         history=np.array(history),
         compile_s=compile_s,
+        lanes=policy.lanes,
         search_s=time.perf_counter() - started,
     )
 

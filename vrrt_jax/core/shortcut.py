@@ -8,7 +8,7 @@ from vrrt_jax.core.edges import Edge, Space, distance, free_prefix
 from vrrt_jax.core.types import pytree
 
 LANES = 32
-COARSE_STEPS = 16  # a first look at every candidate
+COARSE_STEPS = 16  # sub-steps of a first check of every candidate
 CHECKED = 4  # of those that pass it, the ones that save most are checked to the end
 EDGE_STEPS = 128  # sub-steps of a candidate, so the longest is 128 times the resolution
 GAIN = 1e-3  # [rad] smallest saving worth a new corner
@@ -59,10 +59,13 @@ def _shortcut(world: Space, q, size, key, rounds, patience) -> _Path:
 
 def _round(world: Space, path: _Path, key: jax.Array) -> _Path:
     """Try 32 candidates, splice in the free one that saves most."""
+    # Lengths along the path; zero beyond its end.
     edges = world.edge(path.q[:-1], path.q[1:])
-    length = world.length(edges)  # zero beyond the end
+    length = world.length(edges)
     along = jnp.concatenate([jnp.zeros(1), jnp.cumsum(length)])
 
+    # Draw pairs of places on the path, the first pair its two ends: on which edge they are, how far
+    # along it, and the configurations there.
     ends = along[-1] * jax.random.uniform(key, (LANES, 2))
     ends = jnp.sort(ends.at[0].set(jnp.stack([0.0 * along[-1], along[-1]])), axis=1)
     index = jnp.clip(jnp.searchsorted(along, ends, side="right") - 1, 0, path.size - 2)
@@ -71,15 +74,18 @@ def _round(world: Space, path: _Path, key: jax.Array) -> _Path:
     q_ends, at = world.end(path.q[index], parts), along[index] + world.length(parts)
     q_a, q_b = q_ends[:, 0], q_ends[:, 1]
 
+    # Straight edges between them. Those that save nothing are cut to length zero.
     direct = world.edge(q_a, q_b)
     saving = at[:, 1] - at[:, 0] - world.length(direct)
     tried = (saving > GAIN) & world.is_resolved(direct, EDGE_STEPS)
     direct = world.truncate(direct, tried.astype(q_a.dtype))
+    # Check all coarsely, and the few that save most to the end.
     coarse = free_prefix(world, q_a, direct, COARSE_STEPS) == COARSE_STEPS
     saving, lane = jax.lax.top_k(jnp.where(tried & coarse, saving, 0.0), CHECKED)
     free = free_prefix(world, q_a[lane], _rows(direct, lane), EDGE_STEPS) == EDGE_STEPS
     saving = jnp.where(free, saving, 0.0)
 
+    # Splice the best one in: its two ends become waypoints between the edges that they lie on.
     most = jnp.argmax(saving)
     best = lane[most]
     first, last = index[best, 0], index[best, 1]

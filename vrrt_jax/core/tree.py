@@ -112,10 +112,15 @@ def distances(world: Space, tree: Tree, q: jax.Array, among: jax.Array | bool = 
     return world.distances(tree.q, q, occupied(tree) & among)
 
 
-def branch_path(tree: Tree, index: int | None = None) -> np.ndarray:
-    """The path (P, D) from the root of a node to it; the node with the best score by default."""
-    index = int(np.argmin(tree.score)) if index is None else index
+def branch_path(tree: Tree, index: int) -> np.ndarray:
+    """The path (P, D) to a node from the root that it hangs on."""
     return np.asarray(tree.q)[lineage(tree, index)]
+
+
+def best_path(tree: Tree) -> np.ndarray | None:
+    """The path (P, D) from the start, node 0, to the best node; None if no edges join them."""
+    best = int(np.argmin(tree.score))
+    return branch_path(tree, best) if lineage(tree, best)[0] == 0 else None
 
 
 def lineage(tree: Tree, index: int) -> np.ndarray:

@@ -55,11 +55,11 @@ class TraceIgnoredNames(tuple):
     __slots__ = ()
 
     def __eq__(self, other: object) -> bool:
-        """Equal to any other labels."""
+        """Equal to any other names."""
         return isinstance(other, TraceIgnoredNames)
 
     def __hash__(self) -> int:
-        """One hash for all labels."""
+        """One hash for all names."""
         return 0
 
 
@@ -134,7 +134,9 @@ class ExpansionPolicy(Protocol[Payload]):
     """A planner: a pytree whose arrays are traced, so that a new setting never re-compiles.
 
     The kernel calls ``propose``, ``evaluate`` and ``after_insert`` in every iteration, traced; the
-    other methods run on the host, before and after the search.
+    other methods run on the host, before and after the search. To a goal that is no configuration,
+    such as an image, the scores have to be losses: :func:`vrrt_jax.plan` then chooses where to end
+    among all nodes, and does not ask ``extract_path``.
     """
 
     @property

@@ -121,12 +121,12 @@ def _checked_path(robot: Robot, path: np.ndarray) -> np.ndarray:
     path = np.asarray(path, np.float64)
     if path.ndim != 2 or path.shape[1] != robot.num_joints or len(path) == 0:
         raise ValueError(
-            f"the path has shape {path.shape}; expected (way-points, {robot.num_joints}), one "
+            f"the path has shape {path.shape}; expected (waypoints, {robot.num_joints}), one "
             f"column for each of: {', '.join(robot.joint_names)}"
         )
     if not np.isfinite(path).all():
         row = int(np.flatnonzero(~np.isfinite(path).all(1))[0])
-        raise ValueError(f"way-point {row} of the path is not finite: {path[row]}")
+        raise ValueError(f"waypoint {row} of the path is not finite: {path[row]}")
     return path
 
 

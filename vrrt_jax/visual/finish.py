@@ -12,19 +12,13 @@ from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import free_prefix
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners import RRTConnect
-from vrrt_jax.core.postprocess import plan_result, postprocess, unchecked
-from vrrt_jax.core.result import (
-    EARLY_STOPS,
-    STATUS_OF,
-    PlanResult,
-    Status,
-    with_time_of,
-)
+from vrrt_jax.core.result import EARLY_STOPS, PlanResult, Status, with_time_of
 from vrrt_jax.core.search import SearchResult, make_termination, search
 from vrrt_jax.core.timing import timed
+from vrrt_jax.outcome import Chosen, finish, time_left
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.exact import exact_scene
-from vrrt_jax.scene.verify import check_path, verify_path
+from vrrt_jax.scene.verify import verify_path
 from vrrt_jax.scene.world import World, obstacle_list, overrides_is_free, with_margin
 from vrrt_jax.visual.distinct import distances_to, distinct
 from vrrt_jax.visual.polish import Polished, evaluate_cost, linearize, polish
@@ -37,23 +31,11 @@ SWEEP_STEP = 0.02  # [rad] between configurations of a straight line that is tri
 SWEEP_MARGIN = 0.002  # [m] that it keeps away: what links move between two of the last check
 SAME_LOSS = 1.05  # losses within this factor are the same match
 AMBIGUITY_RATIO = 1.1  # and within this factor the image does not tell which it is
-ADVICE = {
-    Status.SOLVED: "",
-    Status.NO_MATCH: (
-        "check the camera and the self-model, add a view, or raise budget.max_iterations"
-    ),
-    Status.NO_PATH: "raise budget.connect_iterations and tree.capacity, or move the obstacles",
-    Status.MAX_ITERATIONS: "raise budget.max_iterations",
-    Status.TREE_FULL: "raise tree.capacity",
-    Status.TIME_LIMIT: "raise budget.time_limit_s",
-    Status.INTERRUPTED: "run it again",
-    Status.NOT_VERIFIED: "lower the world's resolution or raise its margin",
-}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Ends:
-    """Where a path may end."""
+    """Configurations that a path may end at."""
 
     q: np.ndarray  # (n, D)
     loss: np.ndarray  # (n,)
@@ -62,16 +44,6 @@ class Ends:
     rivals: list[int]  # which of them are worth naming beside the one that is taken
     paths: dict[int, np.ndarray]  # (P, D) by end, where the tree has one
     threshold: float  # loss of a match
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Chosen:
-    """The end that was taken, and the way there."""
-
-    path: np.ndarray | None  # (P, D), None if there is no way
-    target: np.ndarray  # (D,)
-    loss: float
-    threshold: float
 
 
 def finish_visual(
@@ -83,7 +55,7 @@ def finish_visual(
     key: jax.Array,
     config: PlannerConfig,
 ) -> PlanResult:
-    """Choose where to end, find a way there, shorten and verify it.
+    """Choose where to end, find a path there, shorten and verify it.
 
     Args:
         robot: whose path it is.
@@ -120,10 +92,10 @@ def finish_visual(
         key = jax.random.fold_in(key, again)
         idle = dataclasses.replace(found, compile_s=0.0, search_s=0.0)
         rest = time_left(config, result.timing["search_s"])
-        wary = with_margin(world, again * MARGIN_STEP)
-        other, path = _connect(wary, idle, q_start, target, key, rest)
+        farther = with_margin(world, again * MARGIN_STEP)
+        other, path = _connect(farther, idle, q_start, target, key, rest)
         chosen = dataclasses.replace(chosen, path=path)
-        other = finish(robot, wary, other, chosen, q_start, key, config)
+        other = finish(robot, farther, other, chosen, q_start, key, config)
         other = dataclasses.replace(other, expansions=0)  # of the same search
         result = with_time_of(other if other.ok else result, result, other)
 
@@ -267,64 +239,3 @@ def _connect(
         search_s=found.search_s + connection.search_s,
     )
     return found, policy.extract_path(connection.tree)
-
-
-def time_left(config: PlannerConfig, spent_s: float) -> PlannerConfig:
-    """The same settings, with what is left of the time."""
-    left_s = max(0.0, config.budget.time_limit_s - spent_s)
-    return config.changed({"budget.time_limit_s": left_s})
-
-
-def finish(
-    robot: Robot,
-    world: World,
-    found: SearchResult,
-    chosen: Chosen,
-    q_start: np.ndarray,
-    key: jax.Array,
-    config: PlannerConfig,
-) -> PlanResult:
-    """Shorten and verify the chosen path, and say what became of the plan.
-
-    Without a path the result is the start alone.
-
-    Args:
-        robot: whose path it is.
-        world: robot and obstacles.
-        found: the search.
-        chosen: where to, and the raw path.
-        q_start: (D,).
-        key: random key of shortcutting.
-        config: settings.
-    """
-    done = unchecked(q_start[None])
-    if chosen.path is not None:
-        done = postprocess(
-            world,
-            chosen.path,
-            lambda path: check_path(robot, world, path, step=config.budget.verify_step),
-            key=key,
-            rounds=config.budget.shortcut_rounds,
-        )
-    matched = chosen.loss <= chosen.threshold
-    if matched and done.is_verified:
-        status = Status.SOLVED
-    elif found.stopped in EARLY_STOPS:
-        status = STATUS_OF[found.stopped]
-    elif chosen.path is None:
-        status = Status.NO_PATH
-    elif not matched:
-        status = STATUS_OF.get(found.stopped, Status.NO_MATCH)
-    else:
-        status = Status.NOT_VERIFIED
-    return plan_result(
-        world,
-        found,
-        done,
-        status=status,
-        advice=ADVICE[status],
-        target=chosen.target,
-        loss=chosen.loss,
-        match_threshold=chosen.threshold,
-        lanes=config.tree.lanes,
-    )

@@ -61,7 +61,7 @@ class CloseUp:
 class ImageGoal:
     """The robot should look like one image, or like several from several cameras.
 
-    Raises nothing by itself: :func:`vrrt_jax.plan` checks it against the robot.
+    :func:`vrrt_jax.plan` checks it against the robot.
     """
 
     self_model: SelfModel  # how the robot looks
@@ -70,7 +70,9 @@ class ImageGoal:
     image: np.ndarray | Sequence[np.ndarray]
     # (H, W) bool, True for the pixels that are compared, where not all are; or V of them
     mask: np.ndarray | Sequence[np.ndarray] | None = None
-    objective: type[ImageObjective] = ImageObjective  # a subclass may change the loss
+    # A subclass may change the loss. The threshold stays the one that is calibrated for the mean
+    # squared error, times the setting match.scale.
+    objective: type[ImageObjective] = ImageObjective
 
     @property
     def views(self) -> tuple[list[Camera], list[np.ndarray], list[np.ndarray] | None]:

@@ -91,7 +91,7 @@ class VisualRRT:
         self, world: World, goal: Goal, q_roots: np.ndarray, capacity: int
     ) -> Tree[VisualNode]:
         """A forest of the start and other roots; those in collision are never expanded."""
-        return init_forest(world, goal, jnp.asarray(q_roots), capacity)
+        return tree_from_roots(world, goal, jnp.asarray(q_roots), capacity)
 
     def goal_score(self, goal: Goal) -> float:
         """The goal's own threshold."""
@@ -211,8 +211,7 @@ class VisualRRT:
 
     def extract_path(self, tree: Tree[VisualNode]) -> np.ndarray | None:
         """The path (P, D) to the best node, if tree edges join it to the start."""
-        best = int(np.argmin(tree.score))
-        return trees.branch_path(tree, best) if trees.lineage(tree, best)[0] == 0 else None
+        return trees.best_path(tree)
 
 
 def _losses_and_gradients(world: World, goal: Goal, q: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -221,7 +220,7 @@ def _losses_and_gradients(world: World, goal: Goal, q: jax.Array) -> tuple[jax.A
 
 
 @partial(jax.jit, static_argnums=3)
-def init_forest(world: World, goal: Goal, q: jax.Array, capacity: int) -> Tree[VisualNode]:
+def tree_from_roots(world: World, goal: Goal, q: jax.Array, capacity: int) -> Tree[VisualNode]:
     """Roots ``q`` (R, D), the start first; those in collision are never expanded."""
     score, grad = _losses_and_gradients(world, goal, q)
     blocked = ~jax.vmap(world.is_free)(q)

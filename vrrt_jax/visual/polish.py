@@ -46,7 +46,7 @@ LEAST_COVERED = 0.01  # share of a close-up; a hand that is hidden tells nothing
 class PriorGoal:
     """A goal, and a weak preference for configurations near the start."""
 
-    goal: Any  # with ``loss`` and ``residual``
+    goal: Any  # a LeastSquaresGoal
     q_start: jax.Array  # (D,)
     prior: jax.Array  # () cost of a radian away from the start
 

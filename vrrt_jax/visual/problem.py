@@ -31,7 +31,8 @@ def make_problem(
     """Prepare a goal.
 
     An :class:`ImageGoal` is shrunk to the resolution of each stage. Any other goal with a
-    differentiable loss serves all stages as it is; it is polished if it has residuals.
+    differentiable loss serves all stages as it is; it is polished if it is a
+    :class:`~vrrt_jax.core.goal.LeastSquaresGoal`.
 
     Args:
         robot: whose goal it is.

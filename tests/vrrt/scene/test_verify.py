@@ -39,7 +39,7 @@ def pendulum(tmp_path_factory):
 
 
 def swing(panda, start, end):
-    """Two way-points that differ in joint 1 only."""
+    """Two waypoints that differ in joint 1 only."""
     path = np.tile(panda.home, (2, 1))
     path[:, 0] = start, end
     return path
@@ -216,9 +216,9 @@ def test_typical_path_is_verified_in_time(panda):
 @pytest.mark.parametrize(
     ("path", "arguments", "message"),
     [
-        (np.zeros((2, 6)), {}, r"shape \(2, 6\); expected \(way-points, 7\).*joint1, joint2"),
+        (np.zeros((2, 6)), {}, r"shape \(2, 6\); expected \(waypoints, 7\).*joint1, joint2"),
         (np.zeros((0, 7)), {}, r"shape \(0, 7\)"),
-        (np.full((2, 7), np.nan), {}, "way-point 0 of the path is not finite"),
+        (np.full((2, 7), np.nan), {}, "waypoint 0 of the path is not finite"),
         (np.zeros((2, 7)), {"step": 0.0}, "step is 0.0; expected a positive"),
         (np.zeros((2, 7)), {"geometry": "mesh"}, "expected one of: auto, meshes, spheres"),
     ],

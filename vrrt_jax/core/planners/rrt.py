@@ -81,7 +81,7 @@ class RRT(PytreeSubclasses):
 
     def extract_path(self, tree: Tree) -> np.ndarray | None:
         """The path (P, D) to the node nearest to the goal."""
-        return trees.branch_path(tree)
+        return trees.best_path(tree)
 
     def sample_aims(
         self, world: Space, goal: ConfigurationGoal, tree: Tree, key: jax.Array

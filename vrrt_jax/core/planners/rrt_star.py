@@ -2,7 +2,8 @@
 
 from typing import Any, ClassVar, Self
 
-import jax
+import jax.numpy as jnp
+import numpy as np
 
 from vrrt_jax.core.edges import Space, num_checks
 from vrrt_jax.core.goal import ConfigurationGoal
@@ -27,6 +28,18 @@ class RRTStar(RRT):
         rewire_steps = num_checks(world, cls.MAX_REWIRED_EDGE)
         return super().for_world(world, rewire_steps=rewire_steps, **settings)
 
+    def init(
+        self, world: Space, goal: ConfigurationGoal, q_roots: np.ndarray, capacity: int
+    ) -> Tree:
+        """See :meth:`RRT.init`.
+
+        Raises:
+            ValueError: sub-steps are asked for, which rewiring would leave behind.
+        """
+        if self.intermediate:
+            raise ValueError("RRT* keeps no sub-steps as nodes; expected intermediate=False")
+        return super().init(world, goal, q_roots, capacity)
+
     def goal_score(self, goal: ConfigurationGoal) -> float:
         """None: a path can always be shorter."""
         return -float("inf")
@@ -44,7 +57,7 @@ class RRTStar(RRT):
             world,
             tree,
             expansion,
-            radius=jax.numpy.float32(self.rewire_radius),
+            radius=jnp.float32(self.rewire_radius),
             edge_steps=self.rewire_steps,
             checks=self.lanes,
         )

@@ -1,0 +1,114 @@
+"""Plans to goals that are known by their loss: seeds, a search, its end; and again if it failed."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from vrrt_jax.config import PlannerConfig
+from vrrt_jax.core.interrupt import interruptible
+from vrrt_jax.core.result import ABORTED, PlanResult, Status, with_time_of
+from vrrt_jax.core.search import make_termination, search
+from vrrt_jax.core.timing import timed
+from vrrt_jax.core.types import ExpansionPolicy, Goal, Tree
+from vrrt_jax.outcome import time_left
+from vrrt_jax.robots.robot import Robot
+from vrrt_jax.scene.world import World
+from vrrt_jax.visual.finish import finish_visual
+from vrrt_jax.visual.policy import tree_from_roots
+from vrrt_jax.visual.problem import VisualProblem
+from vrrt_jax.visual.seeds import sample_seeds, seeded_roots
+
+SEED_KEY = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
+RETRYABLE = (Status.NO_MATCH, Status.NO_PATH, Status.NOT_VERIFIED)  # worth another attempt
+
+Progress = Callable[..., Any] | None
+
+
+def plan_by_loss(
+    robot: Robot,
+    world: World,
+    problem: VisualProblem,
+    policy: ExpansionPolicy,
+    roots: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+    on_progress: Progress,
+) -> PlanResult:
+    """Attempts from different seeds, until one is solved; the best of them."""
+    with interruptible():
+        result = attempt(robot, world, problem, policy, roots, key, config, on_progress)
+        for again in range(1, config.budget.attempts):
+            rest = time_left(config, result.timing["search_s"])
+            if result.status not in RETRYABLE or rest.budget.time_limit_s == 0:
+                break
+            key = jax.random.fold_in(key, SEED_KEY - again)
+            other = attempt(robot, world, problem, policy, roots, key, rest, on_progress)
+            if other.status in ABORTED and not other.ok:
+                # It ended before its loss could be compared with the other's.
+                best = dataclasses.replace(result, status=other.status, advice=other.advice)
+            else:
+                best = min(result, other, key=lambda r: (not r.ok, r.loss))
+            result = with_time_of(best, result, other)
+    return result
+
+
+def attempt(
+    robot: Robot,
+    world: World,
+    problem: VisualProblem,
+    policy: ExpansionPolicy,
+    roots: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+    on_progress: Progress,
+) -> PlanResult:
+    """Sample seeds around the start (the first of the roots), search and finish, once."""
+    tree, compile_s, seed_s = seeded_tree(world, problem, policy, roots, key, config)
+    found = search(
+        world,
+        problem.goal,
+        policy,
+        tree,
+        key=key,
+        termination=termination_of(config, policy, problem.goal),
+        time_limit_s=time_left(config, seed_s).budget.time_limit_s,
+        on_progress=on_progress,
+    )
+    found = dataclasses.replace(
+        found, compile_s=found.compile_s + compile_s, search_s=found.search_s + seed_s
+    )
+    return finish_visual(robot, world, problem, found, roots[0], key, config)
+
+
+def seeded_tree(
+    world: World,
+    problem: VisualProblem,
+    policy: ExpansionPolicy,
+    roots: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+) -> tuple[Tree, float, float]:
+    """The forest before the search, and the seconds for its compilation and for itself."""
+    key = jax.random.fold_in(key, SEED_KEY)
+
+    def grow() -> Tree:
+        all_roots = seeded_roots(world, problem.seeds, roots, key)
+        return policy.init(world, problem.goal, all_roots, config.tree.capacity)
+
+    return timed(grow, sample_seeds, tree_from_roots)
+
+
+def termination_of(config: PlannerConfig, policy: ExpansionPolicy, goal: Goal) -> Any:
+    """When a search by loss ends."""
+    budget = config.budget
+    return make_termination(
+        policy.goal_score(goal),
+        settle_iterations=budget.settle_iterations,
+        max_iterations=budget.max_iterations,
+        patience=budget.patience,
+        min_improvement=budget.min_improvement,
+        min_ratio=budget.min_ratio,
+    )

@@ -1,0 +1,104 @@
+"""How a plan ends: from the chosen path to a result, and what to try next."""
+
+import dataclasses
+
+import jax
+import numpy as np
+
+from vrrt_jax.config import PlannerConfig
+from vrrt_jax.core.postprocess import plan_result, postprocess, unchecked
+from vrrt_jax.core.result import EARLY_STOPS, STATUS_OF, PlanResult, Status
+from vrrt_jax.core.search import SearchResult
+from vrrt_jax.robots.robot import Robot
+from vrrt_jax.scene.verify import check_path
+from vrrt_jax.scene.world import World
+
+# What to try next, by how a plan to an image ended.
+ADVICE = {
+    Status.SOLVED: "",
+    Status.NO_MATCH: (
+        "check the camera and the self-model, add a view, or raise budget.max_iterations"
+    ),
+    Status.NO_PATH: "raise budget.connect_iterations and tree.capacity, or move the obstacles",
+    Status.MAX_ITERATIONS: "raise budget.max_iterations",
+    Status.TREE_FULL: "raise tree.capacity",
+    Status.TIME_LIMIT: "raise budget.time_limit_s",
+    Status.INTERRUPTED: "run it again",
+    Status.NOT_VERIFIED: "lower the world's resolution or raise its margin",
+}
+
+# The same of a plan to a joint goal, where it differs.
+JOINT_ADVICE = ADVICE | {
+    Status.NO_MATCH: "raise budget.max_iterations",
+    Status.NO_PATH: "raise budget.max_iterations and tree.capacity, or move the obstacles",
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Chosen:
+    """The end that was chosen, and the path to it."""
+
+    path: np.ndarray | None  # (P, D), None if none was found
+    target: np.ndarray  # (D,)
+    loss: float
+    threshold: float
+
+
+def time_left(config: PlannerConfig, spent_s: float) -> PlannerConfig:
+    """The same settings, with what is left of the time."""
+    left_s = max(0.0, config.budget.time_limit_s - spent_s)
+    return config.changed({"budget.time_limit_s": left_s})
+
+
+def finish(
+    robot: Robot,
+    world: World,
+    found: SearchResult,
+    chosen: Chosen,
+    q_start: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+) -> PlanResult:
+    """Shorten and verify the chosen path, and say what became of the plan.
+
+    Without a path the result is the start alone.
+
+    Args:
+        robot: whose path it is.
+        world: robot and obstacles.
+        found: the search.
+        chosen: where to, and the raw path.
+        q_start: (D,).
+        key: random key of shortcutting.
+        config: settings.
+    """
+    done = unchecked(q_start[None])
+    if chosen.path is not None:
+        done = postprocess(
+            world,
+            chosen.path,
+            lambda path: check_path(robot, world, path, step=config.budget.verify_step),
+            key=key,
+            rounds=config.budget.shortcut_rounds,
+        )
+    matched = chosen.loss <= chosen.threshold
+    if matched and done.is_verified:
+        status = Status.SOLVED
+    elif found.stopped in EARLY_STOPS:
+        status = STATUS_OF[found.stopped]
+    elif chosen.path is None:
+        status = Status.NO_PATH
+    elif not matched:
+        status = STATUS_OF.get(found.stopped, Status.NO_MATCH)
+    else:
+        status = Status.NOT_VERIFIED
+    return plan_result(
+        world,
+        found,
+        done,
+        status=status,
+        advice=ADVICE[status],
+        target=chosen.target,
+        loss=chosen.loss,
+        match_threshold=chosen.threshold,
+    )
