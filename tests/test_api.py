@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import vrrt_jax
+from vrrt_jax.outcome import ADVICE
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "vrrt_jax"
@@ -59,3 +60,29 @@ def test_the_readme_runs(index, tmp_path, monkeypatch):
     scope = {}
     exec(compile(codes[index], "README.md", "exec"), scope)
     assert scope["result"].ok
+
+
+def test_the_documents_give_the_advice_that_plans_give():
+    page = (ROOT / "docs" / "your_own.md").read_text()
+    for status, advice in ADVICE.items():
+        if advice and status.name != "INTERRUPTED":
+            assert f"| `{status.name}` | {status.value} | {advice} |" in page, status
+
+
+def test_the_python_of_the_documents_compiles():
+    """Names that the documents import exist."""
+    for page in [*(ROOT / "docs").glob("*.md"), ROOT / "CONTRIBUTING.md"]:
+        for code in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL):
+            tree = ast.parse(code)
+            for node in ast.walk(tree):
+                if isinstance(node, ast.ImportFrom) and node.module:
+                    module = importlib.import_module(node.module)
+                    for alias in node.names:
+                        assert hasattr(module, alias.name), f"{page.name}: {alias.name}"
+                elif (
+                    isinstance(node, ast.Attribute)
+                    and isinstance(node.value, ast.Name)
+                    and node.value.id in ("vrrt_jax", "nrp_jax")
+                ):
+                    package = importlib.import_module(node.value.id)
+                    assert hasattr(package, node.attr), f"{page.name}: {node.attr}"
