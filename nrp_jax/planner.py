@@ -16,7 +16,7 @@ from nrp_jax.samplers import check_fits, load_sampler
 from nrp_jax.scene.exact import STEP, ExactScene, verify
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld, batch_is_free, build_world
-from vrrt_jax.core.check_protocols import check_policy
+from vrrt_jax.core.check_protocols import check_extracted_path, check_policy, overrides_is_free
 from vrrt_jax.core.edges import enforce_bounds, unwrapped
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.interrupt import interruptible
@@ -169,6 +169,11 @@ def check_configuration(
     """
     q = np.asarray(q, np.float32)
     names = ", ".join(robot.joint_names)
+    if world.lower.shape != (robot.num_joints,):
+        raise ValueError(
+            f"the world is of a robot with {len(world.lower)} joints, and '{robot.name}' has "
+            f"{robot.num_joints}: build the world for it"
+        )
     if q.shape != (robot.num_joints,):
         raise ValueError(f"the {what} has shape {q.shape}; expected ({robot.num_joints},): {names}")
     lower, upper, is_continuous = (
@@ -184,6 +189,11 @@ def check_configuration(
         )
     inside = enforce_bounds(world, jnp.asarray(q))
     if not batch_is_free(world, inside[None])[0]:
+        if overrides_is_free(world):
+            raise ValueError(
+                f"the {what} is refused by {type(world).__name__}.is_free: "
+                f"{np.round(q, 3).tolist()}; choose another one"
+            )
         raise ValueError(
             f"the {what} touches the map, the floor or the robot itself: {np.round(q, 3).tolist()};"
             " choose another one"
@@ -254,6 +264,7 @@ def _finish(
 ) -> PlanResult:
     """Shorten and verify what a search found."""
     path = policy.extract_path(found.tree)
+    check_extracted_path(policy, path, np.asarray(start))
     raw = np.asarray(start)[None] if path is None else path
     reached = float(goal.loss(world, jnp.asarray(raw[-1]))) <= float(goal.threshold)
 

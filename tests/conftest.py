@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import resource
 import sys
 from pathlib import Path
 
@@ -12,20 +13,36 @@ import pytest
 import vrrt_jax
 from vrrt_jax.scene import exact
 
+LARGE = 1.2e9  # bytes
+
 # Compiled programs survive between runs and are shared by pytest-xdist's workers.
 jax.config.update("jax_compilation_cache_dir", str(Path.home() / ".cache" / "vrrt_jax_tests"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
-@pytest.fixture(scope="module", autouse=True)
 def forget_what_was_compiled():
-    """Each file begins without the programs and scenes of the one before: few files share any."""
-    yield
+    """Drop compiled programs and scenes, and give what is freed back to the system."""
     jax.clear_caches()
     exact._build.cache_clear()
     gc.collect()
-    if sys.platform == "linux":  # freed memory goes back to the system, not into fragments
+    if sys.platform == "linux":
         ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def begin_small():
+    """Each file begins without the programs and scenes of the one before: few files share any."""
+    yield
+    forget_what_was_compiled()
+
+
+@pytest.fixture(autouse=True)
+def stay_small():
+    """A worker stays below what a laptop has; the programs come back from the cache on disk."""
+    yield
+    statm = Path("/proc/self/statm")
+    if statm.exists() and int(statm.read_text().split()[1]) * resource.getpagesize() > LARGE:
+        forget_what_was_compiled()
 
 
 @pytest.fixture(scope="session")

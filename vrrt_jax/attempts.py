@@ -80,7 +80,7 @@ def attempt(
     found = dataclasses.replace(
         found, compile_s=found.compile_s + compile_s, search_s=found.search_s + seed_s
     )
-    return finish_visual(robot, world, problem, found, roots[0], key, config)
+    return finish_visual(robot, world, problem, policy, found, roots[0], key, config)
 
 
 def seeded_tree(

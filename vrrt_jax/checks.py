@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.check_protocols import overrides_is_free
 from vrrt_jax.robots.kinematics import Chain, link_poses
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.verify import contacts
-from vrrt_jax.scene.world import World, batch_is_free, obstacle_list, overrides_is_free
+from vrrt_jax.scene.world import World, batch_is_free, obstacle_list
 from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera, SplatModel

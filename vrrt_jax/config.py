@@ -129,11 +129,16 @@ class PlannerConfig:
         Raises:
             ValueError: there is no such setting; the message lists those that exist.
         """
-        return settings.changed(self, dict(changes))
+        return settings.changed(self, changes)
 
 
 def check_config(config: PlannerConfig) -> None:
     """Raise a ValueError that names the setting out of range."""
+    if not isinstance(config, PlannerConfig):
+        raise ValueError(
+            f"config is a {type(config).__module__}.{type(config).__name__}; expected a "
+            "vrrt_jax.PlannerConfig"
+        )
     settings.check_settings(config)
     lanes, roots = config.tree.lanes, 2 + min(config.seeds.num, config.seeds.kept)
     if config.tree.capacity < lanes + roots:

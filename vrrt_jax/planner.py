@@ -11,7 +11,7 @@ import numpy as np
 from vrrt_jax import checks
 from vrrt_jax.attempts import Progress, plan_by_loss, seeded_tree, termination_of
 from vrrt_jax.config import PlannerConfig, check_config
-from vrrt_jax.core.check_protocols import check_goal, check_policy
+from vrrt_jax.core.check_protocols import check_extracted_path, check_goal, check_policy
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.planners import PLANNERS, RRT, RRTStar
@@ -283,7 +283,9 @@ def plan_batch(
                 compile_s=found.compile_s + sum(compile_s),
                 search_s=found.search_s + seed_s[i],
             )
-            results.append(finish_visual(robot, world, problem, own, q_start, keys[i], config))
+            results.append(
+                finish_visual(robot, world, problem, policy, own, q_start, keys[i], config)
+            )
     return results
 
 
@@ -311,6 +313,7 @@ def _plan_to_configuration(
         on_progress=on_progress,
     )
     path = policy.extract_path(found.tree)
+    check_extracted_path(policy, path, roots[0])
     end = roots[0] if path is None else path[-1]
     chosen = Chosen(
         path=path,

@@ -59,7 +59,7 @@ def test_packaged_problems_are_solved(tmp_path):
 def test_without_a_solution_the_exit_code_is_one(tmp_path):
     done = vrrt("plan", "--problem", PROBLEMS[0], "--out", tmp_path, "--time-limit", 0, "--paper")
     assert done.returncode == 1
-    assert "TIME_LIMIT" in done.stderr and "raise time_limit_s" in done.stderr
+    assert "TIME_LIMIT" in done.stderr and "raise budget.time_limit_s" in done.stderr
     assert json.loads((tmp_path / "result.json").read_text())["status"] == "TIME_LIMIT"
 
 

@@ -10,9 +10,10 @@ import pytest
 from pictures import Q_GOAL, Q_START, QUICK, picture
 
 import vrrt_jax
-from vrrt_jax import ImageGoal, PlannerConfig
+from vrrt_jax import ImageGoal
 from vrrt_jax import attempts as attempts_module
 from vrrt_jax.core import search as searches
+from vrrt_jax.core import tree as trees
 from vrrt_jax.core.result import with_time_of
 
 
@@ -35,7 +36,7 @@ def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
             ImageGoal(model, camera, image),
             q_start,
             key=jax.random.key(0),
-            config=PlannerConfig().changed(changes or {}),
+            config=QUICK.changed(changes or {}),
         )
 
     result = run()
@@ -57,7 +58,7 @@ def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
     )
     before = len(traces)  # one of the visual search, one of the connection to its match
     assert before <= 2
-    few = {"budget.max_iterations": 4, "budget.attempts": 1, "polish.rounds": 1}
+    few = {"budget.max_iterations": 4, "budget.attempts": 1, "polish.hypotheses": 0}
     run(world=moved, changes=few)
     run(image=picture(panda, self_model, camera, Q_GOAL + 0.1), changes=few)
     run(q_start=Q_START + 0.1, changes=few)
@@ -72,7 +73,13 @@ def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
 
 def test_batch_equals_single_plans(panda, self_model, camera, image, open_world):
     config = QUICK.changed(
-        {"budget.max_iterations": 10, "budget.settle_iterations": 0, "tree.rewiring": False}
+        {
+            "budget.max_iterations": 10,
+            "budget.settle_iterations": 0,
+            "budget.attempts": 1,
+            "tree.rewiring": False,
+            "polish.hypotheses": 0,
+        }
     )
     other = picture(panda, self_model, camera, Q_GOAL + 0.2)
     key = jax.random.key(5)
@@ -259,3 +266,63 @@ def test_expansions_count_the_planners_own_lanes(panda, open_world):
     )
     assert result.expansions == 8 * result.iterations > 0
     assert f"{result.expansions} expansions" in str(result)
+
+
+def test_a_path_that_does_not_begin_at_the_start_is_told(panda, open_world):
+    class Forgetful(vrrt_jax.RRT):
+        def extract_path(self, tree):
+            return super().extract_path(tree)[1:]
+
+    goal = vrrt_jax.ConfigurationGoal(q=Q_GOAL)
+    with pytest.raises(ValueError, match="Forgetful.extract_path returned begins at"):
+        vrrt_jax.plan(panda, open_world, goal, Q_START, key=jax.random.key(0), planner=Forgetful())
+
+
+def test_the_score_of_a_planner_is_not_believed_as_a_loss(panda, open_world):
+    place = vrrt_jax.link_poses(panda.chain, jnp.asarray(Q_GOAL))[-1, :3, 3]
+    goal = HandGoal(place=place)
+    config = QUICK.changed(
+        {"polish.hypotheses": 0, "budget.max_iterations": 2, "budget.attempts": 1, "seeds.num": 0}
+    )
+    result = vrrt_jax.plan(
+        panda,
+        open_world,
+        goal,
+        Q_START,
+        key=jax.random.key(0),
+        planner=FlatScores(),
+        config=config,
+    )
+    assert not result.ok
+    expected = goal.loss(open_world, jnp.asarray(result.target))
+    assert result.loss == pytest.approx(float(expected), rel=1e-4)
+
+
+@vrrt_jax.pytree
+class FlatScores:
+    """A planner whose scores are no losses."""
+
+    lanes: int = vrrt_jax.static(default=8)
+    edge_steps: int = vrrt_jax.static(default=8)
+
+    def init(self, world, goal, q_roots, capacity):
+        return trees.create(jnp.asarray(q_roots), jnp.full(len(q_roots), 1e-9), None, capacity)
+
+    def goal_score(self, goal):
+        return float(goal.threshold)
+
+    def propose(self, world, goal, tree, key):
+        step = 0.1 * jax.random.normal(key, (self.lanes, tree.q.shape[1]))
+        yes = jnp.ones(self.lanes, bool)
+        parent = jnp.zeros(self.lanes, jnp.int32)
+        target = tree.q[parent] + step
+        return vrrt_jax.Proposals(parent=parent, target=target, valid=yes, partial=yes, aux=None)
+
+    def evaluate(self, world, goal, q, proposals):
+        return jnp.full(self.lanes, 1e-9), None
+
+    def after_insert(self, world, goal, tree, proposals, expansion):
+        return tree
+
+    def extract_path(self, tree):
+        return trees.best_path(tree)

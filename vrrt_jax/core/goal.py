@@ -42,9 +42,14 @@ class LeastSquaresGoal(PytreeSubclasses):
     threshold: Any  # () the goal is reached by configurations whose loss is at most this
 
     def __init_subclass__(cls, **kwargs: Any):
-        """Derive what a subclass leaves out, from what this very class defines."""
+        """Derive what a subclass leaves out, from what it overrides last."""
         super().__init_subclass__(**kwargs)
-        own = vars(cls)
+        # The class that overrides any of the three first: this one, or one that is mixed in.
+        names = {"loss", "residual", "prediction"}
+        owner = next(kind for kind in cls.__mro__ if names & vars(kind).keys())
+        if owner is not cls and issubclass(owner, LeastSquaresGoal):
+            return  # derived when that class was made
+        own = vars(owner)
         if "prediction" in own and "residual" not in own:
             cls.residual = _residual_from_prediction(own["prediction"])
         elif "residual" in own:

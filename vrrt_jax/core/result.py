@@ -46,7 +46,7 @@ class Verification:
     geometry: str = "primitives"  # what the robot was made of, or "meshes", or "spheres"
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
 class PlanResult:
     """What became of a problem. Letters: ``P`` waypoints, ``D`` joints, ``A`` alternatives."""
 
@@ -83,7 +83,7 @@ class PlanResult:
         """(D,) the end of the path."""
         return self.path[-1]
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         """One line for people."""
         times = ", ".join(f"{k.removesuffix('_s')} {v:.1f} s" for k, v in self.timing.items())
         others = len(self.alternatives)

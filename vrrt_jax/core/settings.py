@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import numbers
+from collections.abc import Mapping
 from typing import Any
 
 
@@ -36,24 +38,33 @@ def check_settings(settings: Any, prefix: str = "") -> None:
         if dataclasses.is_dataclass(value):
             check_settings(value, f"{prefix}{field.name}.")
             continue
+        if isinstance(field.default, bool) and not isinstance(value, bool):
+            raise ValueError(f"{prefix}{field.name}={value!r}; expected True or False")
         if "range" not in field.metadata:
             continue
         low, high, below, optional = field.metadata["range"]
         if value is None and optional:
             continue
-        if value is None or not low <= value <= high or (below and value == high):
+        whole = isinstance(field.default, int)
+        number = isinstance(value, numbers.Integral if whole else numbers.Real)
+        if not number or isinstance(value, bool):
+            raise ValueError(
+                f"{prefix}{field.name}={value!r}; expected {'a whole' if whole else 'a'} number"
+            )
+        if not low <= value <= high or (below and value == high):
             bracket = ")" if below else "]"
             raise ValueError(
                 f"{prefix}{field.name}={value} is out of range; expected [{low}, {high}{bracket}"
             )
 
 
-def changed(settings: Any, changes: dict[str, Any]) -> Any:
+def changed(settings: Any, changes: Mapping[str, Any], prefix: str = "") -> Any:
     """The same settings but for some of them.
 
     Args:
         settings: a dataclass of settings.
         changes: new values by name, such as ``{"tree.lanes": 8}``.
+        prefix: of these names in messages.
 
     Raises:
         ValueError: there is no such setting; the message lists those that exist.
@@ -62,8 +73,17 @@ def changed(settings: Any, changes: dict[str, Any]) -> Any:
         stage, _, rest = name.partition(".")
         names = [field.name for field in dataclasses.fields(settings)]
         if stage not in names:
-            raise ValueError(f"unknown setting '{name}'; have: {', '.join(names)}")
+            known = ", ".join(f"{prefix}{name}" for name in names)
+            raise ValueError(f"unknown setting '{prefix}{name}'; have: {known}")
+        old = getattr(settings, stage)
+        if dataclasses.is_dataclass(old) and not rest and not isinstance(value, type(old)):
+            raise ValueError(
+                f"{prefix}{name}={value!r}; expected a {type(old).__name__}, or a setting of "
+                f"it, such as '{prefix}{name}.{dataclasses.fields(old)[0].name}'"
+            )
+        if rest and not dataclasses.is_dataclass(old):
+            raise ValueError(f"'{prefix}{stage}' is a single setting; there is no '{prefix}{name}'")
         if rest:
-            value = changed(getattr(settings, stage), {rest: value})
+            value = changed(old, {rest: value}, f"{prefix}{stage}.")
         settings = dataclasses.replace(settings, **{stage: value})
     return settings

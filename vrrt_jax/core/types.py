@@ -23,9 +23,56 @@ def pytree(cls):
     """
     if _MARK in vars(cls):
         return cls
-    cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+    cls = dataclasses.dataclass(frozen=True, kw_only=True, repr=False)(cls)
+    if cls.__repr__ is object.__repr__:
+        cls.__repr__ = _short_repr
     setattr(cls, _MARK, True)
-    return jax.tree_util.register_dataclass(cls)
+    _register(cls)
+    return cls
+
+
+def _register(cls: type) -> None:
+    """Make JAX see the fields of a dataclass.
+
+    Not by ``jax.tree_util.register_dataclass``: there, in JAX 0.10.2, structures of different
+    classes with as many fields compare equal, so that a compiled function may run the methods of
+    another class.
+    """
+    fields = dataclasses.fields(cls)
+    leaves = [field.name for field in fields if not field.metadata.get("static")]
+    statics = [field.name for field in fields if field.metadata.get("static")]
+
+    def flatten(thing: Any) -> tuple[tuple, tuple]:
+        values = tuple(getattr(thing, name) for name in leaves)
+        return values, tuple(getattr(thing, name) for name in statics)
+
+    def flatten_with_keys(thing: Any) -> tuple[tuple, tuple]:
+        values, aux = flatten(thing)
+        keys = map(jax.tree_util.GetAttrKey, leaves)
+        return tuple(zip(keys, values, strict=True)), aux
+
+    def unflatten(aux: tuple, values: Any) -> Any:
+        thing = object.__new__(cls)
+        for name, value in zip([*leaves, *statics], [*values, *aux], strict=True):
+            object.__setattr__(thing, name, value)
+        return thing
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+
+
+def _short_repr(thing: Any) -> str:
+    """The fields of a pytree: shapes of arrays, names of classes, other values as they are."""
+    parts = []
+    for field in dataclasses.fields(thing):
+        value = getattr(thing, field.name)
+        if hasattr(value, "shape") and hasattr(value, "dtype"):
+            text = f"{value.dtype}{list(value.shape)}"
+        elif dataclasses.is_dataclass(value) or len(repr(value)) > 60:
+            text = type(value).__name__
+        else:
+            text = repr(value)
+        parts.append(f"{field.name}={text}")
+    return f"{type(thing).__name__}({', '.join(parts)})"
 
 
 class PytreeSubclasses:

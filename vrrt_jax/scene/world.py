@@ -195,10 +195,3 @@ def move_obstacle(
     return with_obstacles(
         world, [dataclasses.replace(o, **changes) if o.name == name else o for o in obstacles]
     )
-
-
-def overrides_is_free(world: World) -> bool:
-    """Whether a subclass has an ``is_free`` of its own, which the exact check does not know."""
-    # The answers of engines come from this package, those of users' subclasses do not.
-    owner = next(kind for kind in type(world).__mro__ if "is_free" in vars(kind))
-    return not owner.__module__.startswith("vrrt_jax.scene.")

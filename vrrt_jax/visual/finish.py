@@ -9,18 +9,21 @@ import numpy as np
 
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core import tree as trees
+from vrrt_jax.core.check_protocols import overrides_is_free
 from vrrt_jax.core.edges import free_prefix
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners import RRTConnect
 from vrrt_jax.core.result import EARLY_STOPS, PlanResult, Status, with_time_of
 from vrrt_jax.core.search import SearchResult, make_termination, search
 from vrrt_jax.core.timing import timed
+from vrrt_jax.core.types import ExpansionPolicy, Goal
 from vrrt_jax.outcome import Chosen, finish, time_left
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.verify import verify_path
-from vrrt_jax.scene.world import World, obstacle_list, overrides_is_free, with_margin
+from vrrt_jax.scene.world import World, obstacle_list, with_margin
 from vrrt_jax.visual.distinct import distances_to, distinct
+from vrrt_jax.visual.policy import VisualRRT
 from vrrt_jax.visual.polish import Polished, evaluate_cost, linearize, polish
 from vrrt_jax.visual.problem import VisualProblem
 
@@ -44,12 +47,14 @@ class Ends:
     rivals: list[int]  # which of them are worth naming beside the one that is taken
     paths: dict[int, np.ndarray]  # (P, D) by end, where the tree has one
     threshold: float  # loss of a match
+    is_polished: bool
 
 
 def finish_visual(
     robot: Robot,
     world: World,
     problem: VisualProblem,
+    policy: ExpansionPolicy,
     found: SearchResult,
     q_start: np.ndarray,
     key: jax.Array,
@@ -61,6 +66,7 @@ def finish_visual(
         robot: whose path it is.
         world: robot and obstacles.
         problem: the goal at every resolution.
+        policy: the planner.
         found: the search.
         q_start: (D,).
         key: random key.
@@ -68,10 +74,13 @@ def finish_visual(
     """
     search_threshold = float(problem.goal.threshold)
     found, ends = _choose_ends(world, problem, found, q_start, key, config)
+    if not ends.is_polished and not isinstance(policy, VisualRRT):
+        ends = _with_true_losses(world, problem.goal, ends)
 
     # Try the ends in turn: by the tree's own path, straight, or by RRT-Connect.
     path, end = None, ends.order[0]
-    for candidate in ends.order[:MAX_GOALS]:
+    all_collide = not np.isfinite(ends.cost[end])
+    for candidate in [] if all_collide else ends.order[:MAX_GOALS]:
         path = ends.paths.get(candidate)
         if path is None:
             found, path = _straight(robot, world, found, q_start, ends.q[candidate])
@@ -101,6 +110,9 @@ def finish_visual(
 
     matching = [k for k in ends.rivals if ends.loss[k] <= ends.threshold]
     alike = [k for k in matching if k != end and ends.cost[k] <= AMBIGUITY_RATIO * ends.cost[end]]
+    if result.status is Status.NO_PATH and all_collide:
+        advice = "all that was found is in collision: move the obstacles"
+        result = dataclasses.replace(result, advice=advice)
     return dataclasses.replace(
         result, alternatives=ends.q[alike], search_match_threshold=search_threshold
     )
@@ -136,8 +148,23 @@ def _choose_ends(
     paths = {end: path for end, path in paths.items() if np.array_equal(path[0], q_start)}
     # On a small image even neighbors look the same: there are no rivals to name.
     return found, Ends(
-        q=q, loss=score, cost=score, order=order, rivals=[], paths=paths, threshold=threshold
+        q=q,
+        loss=score,
+        cost=score,
+        order=order,
+        rivals=[],
+        paths=paths,
+        threshold=threshold,
+        is_polished=False,
     )
+
+
+def _with_true_losses(world: World, goal: Goal, ends: Ends) -> Ends:
+    """The same ends with the goal's own losses: the scores of a user's planner may be others."""
+    loss = ends.loss.copy()
+    for end in ends.order:
+        loss[end] = float(goal.loss(world, jnp.asarray(ends.q[end])))
+    return dataclasses.replace(ends, loss=loss)
 
 
 def _polished_ends(
@@ -152,16 +179,17 @@ def _polished_ends(
     far = distances_to(world, polished.q, q_start) ** 2
     preference = polished.cost * (1.0 + config.match.start_preference * far)
     order = np.lexsort([preference, polished.loss > threshold])
-    rivals = [int(k) for k in order if np.isfinite(polished.cost[k])] or [0]
+    rivals = [int(k) for k in order if np.isfinite(polished.cost[k])]
     matched = [k for k in rivals if polished.loss[k] <= threshold]
     return Ends(
         q=polished.q,
         loss=polished.loss,
         cost=polished.cost,
-        order=matched or rivals,
+        order=matched or rivals or [0],
         rivals=rivals,
         paths={},
         threshold=threshold,
+        is_polished=True,
     )
 
 

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from nrp_jax.cli import main
-from nrp_jax.homes import houses
 from nrp_jax.learning import data, shards
+from nrp_jax.learning.difficulty import fair_house
+from nrp_jax.scene.robots import load_robot
 
 SETTINGS = shards.DatasetSettings(task="snake", queries=6, waypoints=4, nodes=500, seed=3)
 HOMES = {"homes": 2, "test_homes": 1}
@@ -41,7 +42,7 @@ def test_rows_and_homes(folder):
         assert train.rows[key].shape == (48, 8) and train.rows[key].dtype == np.float32
     assert np.bincount(train.rows["home"]).tolist() == [24, 24]
     assert (np.bincount(train.rows["query"]) == 8).all()
-    first = houses.generate_house(shards.home_seed(SETTINGS, "train", 0)).grid
+    first = fair_house(load_robot("snake"), shards.home_seed(SETTINGS, "train", 0)).grid
     assert (train.grids[0].occupied == first.occupied).all()
     for grid in train.grids:
         assert (grid.occupied != test.grids[0].occupied).any()

@@ -206,7 +206,7 @@ def test_a_subclass_is_obeyed_by_every_function(panda, wall_world, keep_out, fre
     assert bool(vrrt_jax.is_free(keep_out, jnp.asarray(q[np.argmax(expected)])))
     blocked = q[np.argmax(before & ~outside)]
     assert not bool(vrrt_jax.is_free(keep_out, jnp.asarray(blocked)))
-    with pytest.raises(ValueError, match="the start is in collision"):
+    with pytest.raises(ValueError, match="the start is refused by KeepOut.is_free"):
         vrrt_jax.plan_to_configuration(
             panda, keep_out, blocked, q[np.argmax(expected)], key=jax.random.key(0)
         )

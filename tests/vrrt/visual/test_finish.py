@@ -38,7 +38,7 @@ def test_ambiguous_goals_are_told(panda, self_model, camera, open_world):
     roots = np.stack([Q_START, Q_GOAL, HALF_TURNED])
     policy = VisualRRT.from_config(config, open_world)
     found = finished(policy.init(open_world, problem.goal, roots, config.tree.capacity))
-    args = (panda, open_world, problem, found, Q_START, jax.random.key(0), config)
+    args = (panda, open_world, problem, policy, found, Q_START, jax.random.key(0), config)
     result = finish.finish_visual(*args)
     assert result.ok
     np.testing.assert_allclose(result.target, Q_GOAL, atol=0.02)
@@ -122,7 +122,7 @@ def test_a_match_without_a_way_is_told(slider, monkeypatch):
     goal = types.SimpleNamespace(threshold=1.0)
     problem: Any = types.SimpleNamespace(goal=goal, polishing=goal)
     start = np.array([-0.5], np.float32)
-    args = (slider, world, problem, found, start, jax.random.key(0), config)
+    args = (slider, world, problem, VisualRRT(), found, start, jax.random.key(0), config)
     result = finish.finish_visual(*args)
     assert result.status is vrrt_jax.Status.NO_PATH and result.target == q[1]
     assert len(result.alternatives) == 0 and result.verification is None
@@ -130,3 +130,7 @@ def test_a_match_without_a_way_is_told(slider, monkeypatch):
     polished = Polished(q=q, loss=np.ones(2), cost=np.ones(2))
     result = finish.finish_visual(*args)
     assert result.ok and result.target == q[0]
+    polished = Polished(q=q, loss=np.full(2, 0.5), cost=np.full(2, np.inf))
+    result = finish.finish_visual(*args)
+    assert result.status is vrrt_jax.Status.NO_PATH
+    assert result.advice == "all that was found is in collision: move the obstacles"

@@ -58,7 +58,13 @@ class RRTConnect:
     def init(
         self, world: Space, goal: ConfigurationGoal, q_roots: Any, capacity: int
     ) -> Tree[ConnectNode]:
-        """The start is node 0 and the goal node 1; other roots are not used."""
+        """The start is node 0 and the goal node 1; other roots are not used.
+
+        Raises:
+            ValueError: there is no lane left to connect the trees.
+        """
+        if self.lanes < 2:
+            raise ValueError(f"RRT-Connect has {self.lanes} lanes; expected 2 or more")
         ends = ConnectNode(
             side=jnp.array([0, 1], jnp.int32),
             fresh=jnp.array([True, True]),
