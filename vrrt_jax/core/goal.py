@@ -51,7 +51,7 @@ class LeastSquaresGoal(PytreeSubclasses):
             return  # derived when that class was made
         own = vars(owner)
         if "prediction" in own and "residual" not in own:
-            cls.residual = _residual_from_prediction(own["prediction"])
+            cls.residual = _residual_from_prediction(own["prediction"], cls.target)
         elif "residual" in own:
             cls.prediction, cls.target = own["residual"], _no_target
         elif "loss" in own:
@@ -82,9 +82,9 @@ _NEITHER = "a goal overrides loss or residual"
 
 # What is derived calls the function of the class that it was derived from, never that of ``self``:
 # a subclass may call ``super()`` from either method without going round in circles.
-def _residual_from_prediction(prediction: Callable) -> Callable:
+def _residual_from_prediction(prediction: Callable, target: Callable) -> Callable:
     def residual(self: Any, world: Any, q: jax.Array) -> jax.Array:
-        return prediction(self, world, q) - self.target()
+        return prediction(self, world, q) - target(self)
 
     return residual
 

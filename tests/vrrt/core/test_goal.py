@@ -9,7 +9,7 @@ import pytest
 from vrrt_jax.core.goal import ConfigurationGoal, LeastSquaresGoal
 from vrrt_jax.core.types import pytree
 
-Q = jnp.array([0.3, -0.4])
+Q, PLACE = jnp.array([0.3, -0.4]), jnp.array([0.6, -0.8])  # 0.5 apart
 
 
 @pytree
@@ -64,6 +64,17 @@ class ResidualOverLoss(HalfOfDerived):
         return 2.0 * super().residual(world, q)
 
 
+class HalfLoss:
+    """Mixed in, it comes before the goal's own loss."""
+
+    def loss(self, world, q):
+        return 0.5 * super().loss(world, q)  # type: ignore[misc]
+
+
+class Mixed(HalfLoss, ByBoth):
+    pass
+
+
 @pytest.mark.parametrize(
     "kind, loss",
     [
@@ -75,16 +86,17 @@ class ResidualOverLoss(HalfOfDerived):
         (HalfOfDerived, 0.125),
         (HalfOfHalf, 0.0625),
         (ResidualOverLoss, 4 * 0.125),
+        (Mixed, 0.125),
     ],
 )
 def test_loss_residual_and_prediction_agree(kind, loss):
-    goal = kind(place=jnp.zeros(2))
+    goal = kind(place=PLACE)
     assert float(goal.loss(None, Q)) == pytest.approx(loss, rel=1e-5)
     assert float(jnp.sum(goal.residual(None, Q) ** 2)) == pytest.approx(loss, rel=1e-5)
     difference = goal.prediction(None, Q) - goal.target()
     assert float(jnp.sum(difference**2)) == pytest.approx(loss, rel=1e-5)
     slope = jax.grad(lambda q: goal.loss(None, q))(Q)
-    assert jnp.allclose(slope, 2 * loss / 0.25 * Q, rtol=1e-4)
+    assert jnp.allclose(slope, 2 * loss / 0.25 * (Q - PLACE), rtol=1e-4)
 
 
 def test_a_goal_overrides_one_of_them():

@@ -69,3 +69,23 @@ def test_a_loss_of_ones_own_reaches_search_seeds_polishing_and_match(
         assert float(jnp.sum(residual**2)) == pytest.approx(loss, rel=1e-4)
         losses.append(loss)
     assert losses[1] == pytest.approx(0.5 * losses[0], rel=1e-5)
+
+
+class Silhouette(ImageObjective):
+    """What the robot covers, whatever its color."""
+
+    def residual(self, world, q):
+        return super().residual(world, q).reshape(-1, 4)[:, 3]
+
+
+def test_a_residual_of_ones_own_ignores_color(panda, self_model, camera, image, open_world):
+    red = image.copy()
+    red[..., 1:3] = 0.0
+    q = jnp.asarray(Q_GOAL)
+    full, outline = (
+        ImageGoal(self_model, camera, red, objective=objective).at(panda, IMAGE_PX)
+        for objective in (ImageObjective, Silhouette)
+    )
+    assert float(full.loss(open_world, q)) > 10 * float(full.threshold)
+    assert float(outline.loss(open_world, q)) < float(outline.threshold)
+    assert float(outline.loss(open_world, jnp.asarray(Q_START))) > 10 * float(outline.threshold)
