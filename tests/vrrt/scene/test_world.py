@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 import vrrt_jax
+from vrrt_jax.core.check_protocols import overrides_is_free
 from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import batch_link_poses, link_poses
 from vrrt_jax.scene.closed_form import ClosedFormWorld
 from vrrt_jax.scene.mjx import mjx_is_free, mjx_world
 from vrrt_jax.scene.obstacles import load_obstacles, signed_distances
-from vrrt_jax.scene.world import World, batch_is_free, overrides_is_free, with_margin
+from vrrt_jax.scene.world import World, batch_is_free, with_margin
 
 DISTANCE_TOLERANCE = 2e-5  # [m]; worst seen 4e-6, near a plane drawn as a 100 m box
 
