@@ -266,7 +266,7 @@ def _finish(
     path = policy.extract_path(found.tree)
     check_extracted_path(policy, path, np.asarray(start))
     raw = np.asarray(start)[None] if path is None else path
-    reached = float(goal.loss(world, jnp.asarray(raw[-1]))) <= float(goal.threshold)
+    loss, threshold = float(goal.loss(world, jnp.asarray(raw[-1]))), float(goal.threshold)
 
     def check(path: np.ndarray) -> CheckedPath:
         trajectory = trajectory_of(world, path)
@@ -274,7 +274,7 @@ def _finish(
         verification = verify(scene, trajectory, **limits)
         return CheckedPath(path=path, trajectory=trajectory, verification=verification)
 
-    if reached:
+    if loss <= threshold:
         finer = dataclasses.replace(world, resolution=world.resolution / 2)
         done = postprocess(finer, raw, check, key=key)
         status = Status.SOLVED if done.is_verified else Status.NOT_VERIFIED
@@ -288,6 +288,6 @@ def _finish(
         status=status,
         advice=ADVICE[status],
         target=np.asarray(goal.q),
-        loss=float(goal.loss(world, jnp.asarray(done.checked.path[-1]))),
-        match_threshold=float(goal.threshold),
+        loss=loss,
+        match_threshold=threshold,
     )

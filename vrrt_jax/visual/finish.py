@@ -16,7 +16,7 @@ from vrrt_jax.core.planners import RRTConnect
 from vrrt_jax.core.result import EARLY_STOPS, PlanResult, Status, with_time_of
 from vrrt_jax.core.search import SearchResult, make_termination, search
 from vrrt_jax.core.timing import timed
-from vrrt_jax.core.types import ExpansionPolicy, Goal
+from vrrt_jax.core.types import ExpansionPolicy
 from vrrt_jax.outcome import Chosen, finish, time_left
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.exact import exact_scene
@@ -47,7 +47,6 @@ class Ends:
     rivals: list[int]  # which of them are worth naming beside the one that is taken
     paths: dict[int, np.ndarray]  # (P, D) by end, where the tree has one
     threshold: float  # loss of a match
-    is_polished: bool
 
 
 def finish_visual(
@@ -73,9 +72,7 @@ def finish_visual(
         config: settings.
     """
     search_threshold = float(problem.goal.threshold)
-    found, ends = _choose_ends(world, problem, found, q_start, key, config)
-    if not ends.is_polished and not isinstance(policy, VisualRRT):
-        ends = _with_true_losses(world, problem.goal, ends)
+    found, ends = _choose_ends(world, problem, policy, found, q_start, key, config)
 
     # Try the ends in turn: by the tree's own path, straight, or by RRT-Connect.
     path, end = None, ends.order[0]
@@ -121,6 +118,7 @@ def finish_visual(
 def _choose_ends(
     world: World,
     problem: VisualProblem,
+    policy: ExpansionPolicy,
     found: SearchResult,
     q_start: np.ndarray,
     key: jax.Array,
@@ -146,25 +144,20 @@ def _choose_ends(
     order = _best_nodes(world, score, q, q_start, MAX_GOALS, threshold)
     paths = {end: trees.branch_path(found.tree, end) for end in order}
     paths = {end: path for end, path in paths.items() if np.array_equal(path[0], q_start)}
+    loss = score
+    if not isinstance(policy, VisualRRT):  # whose scores are losses
+        loss = score.copy()
+        loss[order] = [float(problem.goal.loss(world, jnp.asarray(q[end]))) for end in order]
     # On a small image even neighbors look the same: there are no rivals to name.
     return found, Ends(
         q=q,
-        loss=score,
+        loss=loss,
         cost=score,
         order=order,
         rivals=[],
         paths=paths,
         threshold=threshold,
-        is_polished=False,
     )
-
-
-def _with_true_losses(world: World, goal: Goal, ends: Ends) -> Ends:
-    """The same ends with the goal's own losses: the scores of a user's planner may be others."""
-    loss = ends.loss.copy()
-    for end in ends.order:
-        loss[end] = float(goal.loss(world, jnp.asarray(ends.q[end])))
-    return dataclasses.replace(ends, loss=loss)
 
 
 def _polished_ends(
@@ -189,7 +182,6 @@ def _polished_ends(
         rivals=rivals,
         paths={},
         threshold=threshold,
-        is_polished=True,
     )
 
 
