@@ -1,5 +1,7 @@
 """A base that drives like a car: edges are Reeds-Shepp curves, while the arm goes straight."""
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 
@@ -26,6 +28,7 @@ class CarWorld(GridWorld):
     """The same with a base that turns and drives like a car, forwards and in reverse."""
 
     radius: jax.Array  # () smallest turning radius [m]
+    node_block: ClassVar[int] = 1 << 20  # one shortlist for all nodes
 
     def distance(self, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`."""

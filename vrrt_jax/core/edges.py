@@ -5,13 +5,18 @@ alike. An edge is a pytree of arrays that lead with the lanes; what is in it, on
 """
 
 import math
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.types import pytree
+
 Edge = Any
+
+CHECKS = 64  # configurations that are checked at once, of all edges together
 
 
 class Space(Protocol):
@@ -32,8 +37,20 @@ class Space(Protocol):
         """() longest sub-step between two collision checks, in the units of distances."""
         ...
 
+    @property
+    def node_block(self) -> int:
+        """How many nodes are best handed to :meth:`distances` at once (static)."""
+        ...
+
     def is_free(self, q: jax.Array) -> jax.Array:
         """Whether ``q`` (D,) touches nothing, () bool."""
+        ...
+
+    def free_span(self, q: jax.Array, edge: Edge) -> jax.Array:
+        """How much of an edge is free around ``q`` (D,) for certain, () as a share of the edge.
+
+        0 if only ``q`` is known to be free; negative if it is not.
+        """
         ...
 
     def distance(self, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
@@ -90,6 +107,15 @@ class StraightLineEdges:
     upper: jax.Array
     is_continuous: jax.Array
     resolution: jax.Array
+    node_block: ClassVar[int] = 512
+
+    def is_free(self, q: jax.Array) -> jax.Array:
+        """See :class:`Space`; for worlds to answer."""
+        raise NotImplementedError
+
+    def free_span(self, q: jax.Array, edge: jax.Array) -> jax.Array:
+        """See :class:`Space`; worlds that know distances can say more than this."""
+        return jnp.where(self.is_free(q), 0.0, -1.0)
 
     def distance(self, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
         """See :class:`Space`."""
@@ -218,13 +244,89 @@ def free_prefix(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) -> 
     Returns:
         (B,) i32 number of leading sub-steps that are free; S where the whole edge is.
     """
-    points = points_along(world, q_from, edge, num_steps)
-    free = jax.vmap(world.is_free)(points.reshape(-1, points.shape[-1]))
-    return jnp.sum(jnp.cumprod(free.reshape(points.shape[:2]), axis=1), axis=1)
+    return _first_blocked(world, q_from, edge, num_steps, lambda step, first: step < first)
 
 
-def points_along(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) -> jax.Array:
-    """Configurations (B, S, D) at the far ends of S equal sub-steps of B edges."""
-    fraction = jnp.arange(1, num_steps + 1, dtype=q_from.dtype) / num_steps
-    edges = jax.tree.map(lambda leaf: leaf[:, None], edge)
-    return world.end(q_from[:, None], world.truncate(edges, fraction))
+def is_edge_free(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) -> jax.Array:
+    """Whether (B,) nothing is touched along whole edges; see :func:`free_prefix`.
+
+    An edge costs nothing more once something is found on it.
+    """
+    whole = num_steps
+    first = _first_blocked(world, q_from, edge, whole, lambda step, first: first == whole)
+    return first == whole
+
+
+@pytree
+class _Checks:
+    known: jax.Array  # (B, S) bool, checked or known to be free
+    first: jax.Array  # (B,) i32 the first sub-step known to be blocked, S if none is
+
+
+def _first_blocked(
+    world: Space,
+    q_from: jax.Array,
+    edge: Edge,
+    num_steps: int,
+    matters: Callable[[jax.Array, jax.Array], jax.Array],
+) -> jax.Array:
+    """The first blocked sub-step (B,) i32 of B edges, S where all that matter are free.
+
+    Ends and middles first: what is found there spares the checks between. A batch of checks is
+    what is left of the coarsest levels, of all edges together.
+
+    Args:
+        world: what to collide with.
+        q_from: (B, D).
+        edge: of B lanes.
+        num_steps: S.
+        matters: of the indices (S,) of sub-steps and the first (B, 1) blocked so far, whether
+            (B, S) a sub-step still has to be checked.
+    """
+    lanes, step = q_from.shape[0], jnp.arange(num_steps)
+    order = jnp.asarray(_coarse_to_fine(num_steps))
+    batch = min(CHECKS, lanes * num_steps)
+
+    def open_checks(checks: _Checks) -> jax.Array:
+        """Which sub-steps have to be checked, (S * B,) the coarsest first."""
+        needed = ~checks.known & matters(step, checks.first[:, None])
+        return needed[:, order].T.reshape(-1)
+
+    def check(checks: _Checks) -> _Checks:
+        # The next batch: lanes and sub-steps.
+        needed = open_checks(checks)
+        chosen = jnp.flatnonzero(needed, size=batch, fill_value=lanes * num_steps)
+        valid = chosen < lanes * num_steps
+        lane = jnp.where(valid, chosen % lanes, 0)
+        at = jnp.where(valid, order[jnp.where(valid, chosen // lanes, 0)], 0)
+        # Their configurations, and how much of the edge is free around each.
+        edges = jax.tree.map(lambda leaf: leaf[lane], edge)
+        part = world.truncate(edges, (at + 1).astype(q_from.dtype) / num_steps)
+        span = jax.vmap(world.free_span)(world.end(q_from[lane], part), edges)
+        # Book what is blocked, and all sub-steps within the free spans.
+        blocked = valid & ~(span >= 0)
+        first = checks.first.at[jnp.where(blocked, lane, lanes)].min(at, mode="drop")
+        reach = jnp.minimum(jnp.maximum(span, 0.0) * num_steps, num_steps).astype(jnp.int32)
+        lane = jnp.where(valid, lane, lanes)
+        change = jnp.zeros((lanes, num_steps + 1), jnp.int32)
+        change = change.at[lane, jnp.maximum(at - reach, 0)].add(1, mode="drop")
+        change = change.at[lane, jnp.minimum(at + reach, num_steps - 1) + 1].add(-1, mode="drop")
+        covered = jnp.cumsum(change, axis=1)[:, :num_steps] > 0
+        return _Checks(known=checks.known | covered, first=first)
+
+    start = _Checks(
+        known=jnp.zeros((lanes, num_steps), bool), first=jnp.full(lanes, num_steps, jnp.int32)
+    )
+    return jax.lax.while_loop(lambda checks: jnp.any(open_checks(checks)), check, start).first
+
+
+def _coarse_to_fine(num: int) -> np.ndarray:
+    """Indices 0 to num - 1, the last one first, then the middle, the quarters and so on."""
+    order, gaps = [num - 1], [(-1, num - 1)]
+    while gaps:
+        low, high = gaps.pop(0)
+        if high - low > 1:
+            middle = (low + high) // 2
+            order.append(middle)
+            gaps += [(low, middle), (middle, high)]
+    return np.array(order, np.int32)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import Space, distance, free_prefix
+from vrrt_jax.core.edges import Space, distance, is_edge_free
 from vrrt_jax.core.types import Expansion, Tree
 
 Payload = TypeVar("Payload")
@@ -103,4 +103,4 @@ def with_costs(world: Space, tree: Tree[Payload]) -> Tree[Payload]:
 
 def _edge_is_free(world: Space, q_from: jax.Array, q_to: jax.Array, steps: int) -> jax.Array:
     edge = world.edge(q_from, q_to)
-    return world.is_resolved(edge, steps) & (free_prefix(world, q_from, edge, steps) == steps)
+    return world.is_resolved(edge, steps) & is_edge_free(world, q_from, edge, steps)

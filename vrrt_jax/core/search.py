@@ -14,8 +14,10 @@ import numpy as np
 from vrrt_jax.core.edges import Space
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.interrupt import interruptible
+from vrrt_jax.core.tree import with_capacity
 from vrrt_jax.core.types import ExpansionPolicy, Tree, pytree
 
+MAX_CAPACITY = 1 << 20  # nodes that a tree may grow to
 CHUNK = 8  # iterations between two checks of the clock
 
 
@@ -152,6 +154,7 @@ def search(
     key: jax.Array,
     termination: Termination,
     time_limit_s: float = float("inf"),
+    max_capacity: int = MAX_CAPACITY,
     batched: bool = False,
     on_progress: Callable[[SearchState, float], Any] | None = None,
 ) -> SearchResult:
@@ -165,16 +168,14 @@ def search(
         key: random key; the same key gives the same tree on the same machine, unless time ends it.
         termination: when to end.
         time_limit_s: wall time without compilation [s], looked at every few iterations.
+        max_capacity: a full tree gets four times the room, up to so many nodes.
         batched: goal, tree, key and termination lead with an axis of Q problems; the search ends
             when all have.
         on_progress: called with the state and the seconds so far after every chunk.
     """
     state = (jax.vmap(initial_state) if batched else initial_state)(tree)
     advance = partial(_chunks if batched else _chunk, world, goal, policy)
-    started = time.perf_counter()
-    jax.block_until_ready(advance(state, termination, key, jnp.int32(0)))
-    compile_s = time.perf_counter() - started
-
+    compile_s = _compile(advance, state, termination, key)
     history = [_record(state, 0.0)]
     started = time.perf_counter()
     with interruptible() as interrupted:
@@ -188,8 +189,16 @@ def search(
             if interrupted.is_set():
                 codes = np.where(codes != StopReason.REACHED, StopReason.INTERRUPTED, codes)
             elif seconds >= time_limit_s:
-                codes = np.where(codes < 0, StopReason.TIME_LIMIT, codes)
-            if np.min(codes) >= 0:
+                unfinished = (codes < 0) | (codes == StopReason.TREE_FULL)
+                codes = np.where(unfinished, StopReason.TIME_LIMIT, codes)
+            capacity = state.tree.parent.shape[-1]
+            if np.any(codes == StopReason.TREE_FULL) and capacity < max_capacity:
+                # More room, and on; compiling for the new size is no time of the search.
+                room = min(4 * capacity, max_capacity)
+                state = dataclasses.replace(state, tree=with_capacity(state.tree, room))
+                again_s = _compile(advance, state, termination, key)
+                compile_s, started = compile_s + again_s, started + again_s
+            elif np.min(codes) >= 0:
                 break
     each = tuple(StopReason(code) for code in codes.tolist())
     return SearchResult(
@@ -203,8 +212,21 @@ def search(
     )
 
 
+def _compile(
+    advance: Callable, state: SearchState, termination: Termination, key: jax.Array
+) -> float:
+    """Compile the loop, if it has not been; seconds."""
+    started = time.perf_counter()
+    jax.block_until_ready(advance(state, termination, key, jnp.int32(0)))
+    return time.perf_counter() - started
+
+
 def _record(state: SearchState, seconds: float) -> tuple[float, float, float, float]:
     """A row of the history; of a batch, the problem that is furthest from its goal."""
-    tree = jax.device_get(state.tree)
-    best = tree.score.min(axis=-1).max()
-    return float(np.max(tree.iteration)), seconds, float(best), float(np.max(tree.size))
+    iteration, best, size = (float(number) for number in jax.device_get(_summary(state.tree)))
+    return iteration, seconds, best, size
+
+
+@jax.jit
+def _summary(tree: Tree) -> tuple[jax.Array, jax.Array, jax.Array]:
+    return jnp.max(tree.iteration), jnp.max(jnp.min(tree.score, axis=-1)), jnp.max(tree.size)

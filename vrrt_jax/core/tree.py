@@ -1,7 +1,7 @@
 """The tree: allocation, insertion, nearest neighbors and the way back to the root."""
 
 import dataclasses
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -110,6 +110,71 @@ def distances(world: Space, tree: Tree, q: jax.Array, among: jax.Array | bool = 
     world with a costly metric rules out from afar.
     """
     return world.distances(tree.q, q, occupied(tree) & among)
+
+
+def nearest(
+    world: Space,
+    tree: Tree,
+    q: jax.Array,
+    label: jax.Array | None = None,
+    wanted: jax.Array | None = None,
+) -> jax.Array:
+    """The nearest node (B,) i32 to each configuration (B, D), 0 if there is none.
+
+    Nodes are looked at block by block, so that empty slots cost nothing.
+
+    Args:
+        world: whose metric it is.
+        tree: the tree.
+        q: (B, D).
+        label: (N,) something about each node; all nodes count without it.
+        wanted: (B,) the label that the nearest node must have.
+    """
+    size = min(world.node_block, tree.capacity)
+
+    def look(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        block, best, index = state
+        # The last block begins early enough to be a whole one; looking twice does no harm.
+        first = jnp.minimum(block * size, tree.capacity - size)
+        among = (first + jnp.arange(size) < tree.size)[None]
+        if label is not None and wanted is not None:
+            among &= jax.lax.dynamic_slice(label, (first,), (size,)) == wanted[:, None]
+        nodes = jax.lax.dynamic_slice_in_dim(tree.q, first, size)
+        apart = world.distances(nodes, q, jnp.broadcast_to(among, (q.shape[0], size)))
+        here, found = jnp.argmin(apart, axis=1), jnp.min(apart, axis=1)
+        return (
+            block + 1,
+            jnp.minimum(best, found),
+            jnp.where(found < best, first + here, index).astype(jnp.int32),
+        )
+
+    nothing = jnp.full(q.shape[0], jnp.inf, q.dtype), jnp.zeros(q.shape[0], jnp.int32)
+    start = (jnp.int32(0), *nothing)
+    return jax.lax.while_loop(lambda state: state[0] * size < tree.size, look, start)[2]
+
+
+def with_capacity(tree: Tree[Payload], capacity: int) -> Tree[Payload]:
+    """The same tree with room for more nodes; of a batch, every tree.
+
+    Args:
+        tree: of capacity N; leaves may lead with an axis of problems.
+        capacity: number of slots, at least N.
+    """
+    axis = tree.parent.ndim - 1
+    more = capacity - tree.parent.shape[axis]
+
+    def padded(leaf: jax.Array, fill: Any = 0) -> jax.Array:
+        width = [(0, more if k == axis else 0) for k in range(leaf.ndim)]
+        return jnp.pad(leaf, width, constant_values=fill)
+
+    return dataclasses.replace(
+        tree,
+        q=padded(tree.q),
+        parent=padded(tree.parent, -1),
+        cost=padded(tree.cost),
+        score=padded(tree.score, jnp.inf),
+        payload=jax.tree.map(padded, tree.payload),
+    )
 
 
 def branch_path(tree: Tree, index: int) -> np.ndarray:

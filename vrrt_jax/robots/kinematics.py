@@ -110,6 +110,50 @@ def place(matrix: jax.Array, poses: jax.Array) -> jax.Array:
     return (poses[:, :3].reshape(-1) @ matrix).reshape(3, -1)
 
 
+def lever_arms(
+    chain: Chain, link: np.ndarray, points: np.ndarray, lower: np.ndarray, upper: np.ndarray
+) -> np.ndarray:
+    """How far points on links move at most while one joint moves by one.
+
+    For a hinge that is the largest distance from its axis that the joints between can give a point.
+    It is bounded by the lengths from axis to axis, and so holds for all configurations.
+
+    Args:
+        chain: L links.
+        link: (n,) link of each point.
+        points: (n, 3) in the links' frames [m].
+        lower: (D,) limits of the joints.
+        upper: (D,) limits of the joints.
+
+    Returns:
+        (D, n) [m/rad], or [m/m] for slides; 0 for joints that do not carry the point.
+    """
+    constant, cosine, sine, slide = (
+        np.asarray(t, np.float64) for t in (chain.constant, chain.cosine, chain.sine, chain.slide)
+    )
+    num_joints, is_slide = len(chain.parents), np.any(slide != 0, axis=(1, 2))
+    anchor = np.zeros((num_joints, 3))  # a point on each axis, in the frame of the joint's link
+    travel = np.where(is_slide, np.maximum(np.abs(lower), np.abs(upper)), 0.0)
+    for j in range(num_joints):
+        # What cosine and sine leave where it is lies on the axis.
+        turning = np.concatenate([cosine[j], sine[j]])
+        anchor[j] = np.linalg.lstsq(turning[:, :3], -turning[:, 3], rcond=1e-6)[0]
+    arms = np.zeros((num_joints, len(link)))
+    for k, (carrier, point) in enumerate(zip(link, points, strict=True)):
+        # From the point towards the base, joint by joint; ``rest`` is what lies beyond the joint
+        # before, and ``place`` where that joint's axis passes.
+        joint, place, rest = carrier - 1, point, 0.0
+        while joint >= 0:
+            offset = place - anchor[joint]
+            # The part of the offset across the axis: what the joint's turn moves.
+            across = np.linalg.norm(cosine[joint][:3, :3] @ offset)
+            arms[joint, k] = 1.0 if is_slide[joint] else across + rest
+            rest += np.linalg.norm(offset) + travel[joint]
+            place = (constant[joint] @ [*anchor[joint], 1.0])[:3]
+            joint = chain.parents[joint] - 1
+    return arms
+
+
 def body_links(model: mujoco.MjModel) -> np.ndarray:
     """The link (nbody,) that every body belongs to: that of its last joint, or its parent's."""
     link = np.zeros(model.nbody, int)

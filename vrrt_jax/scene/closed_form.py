@@ -12,10 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.check_protocols import overrides_is_free
 from vrrt_jax.core.types import pytree
-from vrrt_jax.robots.kinematics import Spheres, link_poses, place, placement
+from vrrt_jax.robots.kinematics import Spheres, lever_arms, link_poses, place, placement
 from vrrt_jax.scene.obstacles import signed_distances
 from vrrt_jax.scene.world import World
+
+ROUNDING = 0.999  # of spans: what single precision may round
 
 
 @pytree
@@ -29,11 +32,38 @@ class ClosedFormWorld(World):
     collision_radius: jax.Array  # (n,) [m]
     self_collision_spheres: jax.Array  # (L * 12, 3 m) placement of these
     contact_distance: jax.Array  # (m, m) at which two of them touch, 0 for unchecked pairs [m]
+    # How far a collision sphere moves, and how much the distance of two self-collision spheres
+    # changes, at most while one joint moves by one, see ``kinematics.lever_arms``.
+    lever_arms: jax.Array  # (D, n) [m/rad] or [m/m]
+    relative_lever_arms: jax.Array  # (D, m, m) the same units
 
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.is_free`."""
         poses = link_poses(self.chain, q)
         return (self._clearance(poses) > self.margin) & (self._self_gap(poses) >= 0)
+
+    def free_span(self, q: jax.Array, edge: jax.Array) -> jax.Array:
+        """See :class:`vrrt_jax.core.edges.Space`: distances divided by the speeds of the spheres.
+
+        So whole pieces of an edge are free, not only the configurations that were looked at.
+        """
+        if overrides_is_free(self):
+            return super().free_span(q, edge)
+        poses = link_poses(self.chain, q)
+        clearance = self._clearances(poses) - self.margin
+        # Self-collision: pairs that are not checked are infinitely far apart.
+        centers = place(self.self_collision_spheres, poses)
+        apart = jnp.sqrt(sum((axis[:, None] - axis[None]) ** 2 for axis in centers) + 1e-12)
+        gap = jnp.where(self.contact_distance > 0, apart - self.contact_distance, jnp.inf)
+        speed, relative_speed = (
+            jnp.tensordot(jnp.abs(edge), arms, 1) + 1e-9
+            for arms in (self.lever_arms, self.relative_lever_arms)
+        )
+        span = jnp.minimum(
+            jnp.min(clearance / speed), jnp.min(gap / relative_speed, initial=jnp.inf)
+        )
+        is_free = (jnp.min(clearance) > 0) & (jnp.min(gap, initial=jnp.inf) >= 0)
+        return jnp.where(is_free, ROUNDING * span, -1.0)
 
     def obstacle_clearance(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.obstacle_clearance`."""
@@ -47,8 +77,12 @@ class ClosedFormWorld(World):
 
     def _clearance(self, poses: jax.Array) -> jax.Array:
         """Smallest distance () between collision spheres and obstacles [m]."""
+        return jnp.min(self._clearances(poses))
+
+    def _clearances(self, poses: jax.Array) -> jax.Array:
+        """Distances (n,) of the collision spheres to the nearest obstacle [m]."""
         distances = signed_distances(self.obstacles, place(self.collision_spheres, poses))
-        return jnp.min(distances - self.collision_radius[:, None])
+        return jnp.min(distances, axis=1) - self.collision_radius
 
     def _self_gap(self, poses: jax.Array) -> jax.Array:
         """Smallest difference () of squared distance and squared contact distance [m^2]."""
@@ -70,6 +104,15 @@ def closed_form_world(robot: Any, fields: Mapping[str, Any]) -> ClosedFormWorld:
     contact_distance = np.zeros((len(radius), len(radius)), np.float32)
     contact_distance[first, second] = radius[first] + radius[second]
 
+    def arms(spheres: Spheres) -> np.ndarray:
+        link, center = np.asarray(spheres.link), np.asarray(spheres.center)
+        return lever_arms(robot.chain, link, center, robot.lower, robot.upper)
+
+    # Only joints between two spheres change their distance: those that carry just one of them.
+    own = arms(robot.self_collision_spheres)
+    relative = np.where(own[:, :, None] > 0, own[:, :, None], own[:, None])
+    relative[(own[:, :, None] > 0) & (own[:, None] > 0)] = 0.0
+
     def placed(spheres: Spheres) -> jax.Array:
         link, center = np.asarray(spheres.link), np.asarray(spheres.center)
         return jnp.asarray(placement(link, center, robot.chain.num_links))
@@ -79,5 +122,7 @@ def closed_form_world(robot: Any, fields: Mapping[str, Any]) -> ClosedFormWorld:
         collision_radius=robot.collision_spheres.radius,
         self_collision_spheres=placed(robot.self_collision_spheres),
         contact_distance=jnp.asarray(contact_distance),
+        lever_arms=jnp.asarray(arms(robot.collision_spheres), jnp.float32),
+        relative_lever_arms=jnp.asarray(relative, jnp.float32),
         **fields,
     )

@@ -2,7 +2,8 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+import threading
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -10,34 +11,110 @@ import numpy as np
 from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.obstacle_kinds import KINDS
-from vrrt_jax.scene.obstacles import Obstacle
+from vrrt_jax.scene.exact_slots import (
+    ALL_BITS,
+    add_slots,
+    lever_arms,
+    place_obstacles,
+    room_for,
+    slots_of,
+)
+from vrrt_jax.scene.obstacles import Obstacle, check_obstacle, floats
 
 _GEOMETRIES = ("auto", "meshes", "spheres")
-_ALL_BITS = 0x7FFFFFFF  # contact bits of obstacles that everything sees
 _FRAME_TOLERANCE = 1e-3  # [m] between the body frames of meshes and of spheres at home
+NEAR = 0.05  # [m] farther pairs are no contacts
+_NOTHING = np.zeros(0), np.zeros((0, 2), int)
 _INSTALL_ADVICE = "install the version of the meshes that the README names"
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class ExactScene:
-    """A robot and obstacles in C MuJoCo."""
+@dataclasses.dataclass(kw_only=True, eq=False)
+class _Compiled:
+    """A compiled robot with room for obstacles; scenes take turns in it."""
 
     model: mujoco.MjModel
     data: mujoco.MjData
     geometry: str  # "meshes" or "spheres"
     num_bodies: int  # bodies from this index on are obstacles, one each
+    slots: Mapping[str, np.ndarray]  # of each kind of obstacle, its geoms
     robot_geoms: np.ndarray  # (r,) int, geoms of moving bodies that are checked against obstacles
+    lever_arms: np.ndarray  # (D, nbody, nbody) see ``exact_slots.lever_arms``
+    holder: "ExactScene | None" = None  # whose obstacles stand in it now
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class ExactScene:
+    """A robot and obstacles in C MuJoCo; for the thread that asked for it."""
+
+    compiled: _Compiled
+    obstacles: tuple[Obstacle, ...]  # (K,)
     obstacle_geoms: np.ndarray  # (K,) int
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The model, with this scene's obstacles in place."""
+        if self.compiled.holder is not self:
+            place_obstacles(self.compiled.model, self.compiled.slots, self.obstacles)
+            self.compiled.holder = self
+        return self.compiled.model
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """The state at the latest configuration that was asked about."""
+        return self.compiled.data
+
+    @property
+    def geometry(self) -> str:
+        """What the robot is made of: "meshes" or "spheres"."""
+        return self.compiled.geometry
+
+    @property
+    def num_bodies(self) -> int:
+        """Bodies of the robot; those from this index on are obstacles."""
+        return self.compiled.num_bodies
+
+    @property
+    def robot_geoms(self) -> np.ndarray:
+        """(r,) int geoms of moving bodies that are checked against obstacles."""
+        return self.compiled.robot_geoms
+
+    def near(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distances (c,) [m] and pairs of bodies (c, 2) that are nearer than :data:`NEAR`.
+
+        Args:
+            q: (D,); negative distances are penetrations.
+        """
+        model, data = self.model, self.data
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        if data.ncon == 0:
+            return _NOTHING
+        contact = data.contact
+        return contact.dist, model.geom_bodyid[contact.geom]
 
     def touching(self, q: np.ndarray) -> list[tuple[int, int]]:
         """Pairs of bodies, smaller index first, that penetrate each other at ``q`` (D,)."""
-        self.data.qpos[:] = q
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_collision(self.model, self.data)
-        contact = self.data.contact
-        bodies = np.sort(self.model.geom_bodyid[contact.geom[contact.dist < 0]], axis=1)
-        return sorted({(int(first), int(second)) for first, second in bodies})
+        distance, bodies = self.near(q)
+        pairs = np.sort(bodies[distance < 0], axis=1)
+        return sorted({(int(first), int(second)) for first, second in pairs})
+
+    def speeds(self, turn: np.ndarray) -> np.ndarray:
+        """How fast bodies approach each other at most, (nbody, nbody) [m], on a turn (D,)."""
+        return np.tensordot(np.abs(turn), self.compiled.lever_arms, 1) + 1e-9
+
+    def free_span(self, near: tuple[np.ndarray, np.ndarray], speeds: np.ndarray) -> float:
+        """The share of a turn after which something may touch first.
+
+        Args:
+            near: from :meth:`near`, nothing penetrating.
+            speeds: (nbody, nbody) from :meth:`speeds`.
+        """
+        distance, bodies = near
+        span = NEAR / speeds.max()  # what is not near is at least so far away
+        if len(distance):
+            span = min(span, np.min(distance / speeds[bodies[:, 0], bodies[:, 1]]))
+        return float(span)
 
     def clearance(self, best: float) -> float:
         """Distance [m] of moving geoms to obstacles, at the latest argument of :meth:`touching`.
@@ -64,8 +141,14 @@ class ExactScene:
 
     def describe(self, pair: tuple[int, int]) -> str:
         """Words for a pair of bodies: "link5 touches box_2"."""
-        first, second = (self.model.body(body).name for body in pair)
-        return f"{first} touches {second.removeprefix('obstacle: ')}"
+        first, second = (self._name(body) for body in pair)
+        return f"{first} touches {second}"
+
+    def _name(self, body: int) -> str:
+        if body < self.num_bodies:
+            return self.compiled.model.body(body).name
+        of_body = self.compiled.model.geom_bodyid[self.obstacle_geoms]
+        return self.obstacles[int(np.flatnonzero(of_body == body)[0])].name
 
 
 def exact_scene(
@@ -89,25 +172,34 @@ def exact_scene(
         raise ValueError(
             f"obstacle names used more than once: {', '.join(twice)}; expected distinct names"
         )
-    return _build(robot, tuple(_hashable(obstacle) for obstacle in obstacles), geometry)
+    obstacles = tuple(_hashable(obstacle) for obstacle in obstacles)
+    for obstacle in obstacles:
+        check_obstacle(obstacle)
+    room = room_for(obstacles)
+    compiled = _build(robot, room, geometry, threading.get_ident())
+    taken = dict.fromkeys(compiled.slots, 0)
+    geoms = []
+    for obstacle in obstacles:
+        geoms.append(compiled.slots[obstacle.kind][taken[obstacle.kind]])
+        taken[obstacle.kind] += 1
+    return ExactScene(compiled=compiled, obstacles=obstacles, obstacle_geoms=np.array(geoms, int))
 
 
 def _hashable(obstacle: Obstacle) -> Obstacle:
-    """The obstacle with tuples of floats, whatever it was made of, and the default color."""
-    x, y, z = (float(value) for value in obstacle.position)
-    qw, qx, qy, qz = (float(value) for value in obstacle.quaternion)
-    a, b, c = (float(value) for value in obstacle.size)
-    return Obstacle(
-        name=obstacle.name,
-        kind=obstacle.kind,
-        position=(x, y, z),
-        quaternion=(qw, qx, qy, qz),
-        size=(a, b, c),
+    """The obstacle with tuples of floats, whatever it was made of."""
+    return dataclasses.replace(
+        obstacle,
+        position=floats(obstacle.position),
+        quaternion=floats(obstacle.quaternion),
+        size=floats(obstacle.size),
     )
 
 
-@functools.lru_cache(maxsize=8)
-def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> ExactScene:
+@functools.lru_cache(maxsize=16)
+def _build(
+    robot: Robot, room: tuple[tuple[str, int], ...], geometry: str, thread: int
+) -> _Compiled:
+    """The robot with room for obstacles; every thread has its own, as MuJoCo's data demands."""
     spec = None if geometry == "spheres" else mesh_spec(robot, visuals=False)
     if spec is None and geometry == "meshes":
         raise ValueError(
@@ -122,30 +214,27 @@ def _build(robot: Robot, obstacles: tuple[Obstacle, ...], geometry: str) -> Exac
         _check_same_robot(robot, spec.copy().compile(), spheres.compile())
         _exclude(spec, robot.ignored_pairs)
     num_bodies = len(spec.bodies)
-    for obstacle in obstacles:
-        # Collision spheres see bit 0 only, and self-collision spheres see no obstacle.
-        _add_obstacle(spec, obstacle, _ALL_BITS if has_meshes else 1)
+    # Collision spheres see bit 0 only, and self-collision spheres see no obstacle.
+    add_slots(spec, room, bits=ALL_BITS if has_meshes else 1)
     spec.memory = 1 << 23  # room for the contacts of a robot deep inside an obstacle
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        reason = "; ".join(str(error).split("\n"))
-        raise ValueError(
-            f"the obstacles do not compile: {reason}; expected sizes as in MJCF, positive"
-        ) from None
-    # Which geoms are measured against each other for the clearance.
-    is_obstacle = model.geom_bodyid >= num_bodies
+    model = spec.compile()
+    # Contacts are reported from afar. Trees of boxes inside bodies are of no use to slots.
+    model.geom_margin[:] = NEAR
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+    # Which geoms are measured against obstacles for the clearance.
     sees_obstacles = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     if not has_meshes:
         sees_obstacles = model.geom_group == int(mjcf_writer.COLLISION_GEOM["group"])
+    sees_obstacles &= model.geom_bodyid < num_bodies
     is_moving = model.body_weldid[model.geom_bodyid] != 0
-    return ExactScene(
+    return _Compiled(
         model=model,
         data=mujoco.MjData(model),
         geometry="meshes" if has_meshes else "spheres",
         num_bodies=num_bodies,
+        slots=slots_of(model, num_bodies),
         robot_geoms=np.flatnonzero(sees_obstacles & is_moving),
-        obstacle_geoms=np.flatnonzero(is_obstacle),
+        lever_arms=lever_arms(model),
     )
 
 
@@ -189,18 +278,3 @@ def _exclude(spec: mujoco.MjSpec, ignored_pairs: Sequence[tuple[str, str]]) -> N
     for first, second in ignored_pairs:
         if first in names and second in names:
             spec.add_exclude(bodyname1=first, bodyname2=second)
-
-
-def _add_obstacle(spec: mujoco.MjSpec, obstacle: Obstacle, bits: int) -> None:
-    """Add an obstacle as a body of its own, so that contacts can name it."""
-    if obstacle.kind not in KINDS:
-        raise ValueError(
-            f"obstacle '{obstacle.name}' is a '{obstacle.kind}'; expected one of: "
-            f"{', '.join(KINDS)}"
-        )
-    kind = KINDS[obstacle.kind]
-    body = spec.worldbody.add_body(
-        name=f"obstacle: {obstacle.name}", pos=obstacle.position, quat=obstacle.quaternion
-    )
-    size = kind.geom_size(obstacle.size)
-    body.add_geom(type=kind.geom, size=size, contype=bits, conaffinity=bits)

@@ -4,6 +4,7 @@ Nothing here shares code with MJX or with the distances that the planner compute
 there cannot hide itself.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,7 +13,7 @@ from vrrt_jax.core.edges import unwrapped
 from vrrt_jax.core.postprocess import CheckedPath
 from vrrt_jax.core.result import Verification
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.exact import exact_scene
+from vrrt_jax.scene.exact import ExactScene, exact_scene
 from vrrt_jax.scene.obstacles import Obstacle
 from vrrt_jax.scene.world import World, obstacle_list
 
@@ -27,6 +28,7 @@ def verify_path(
     *,
     step: float = 0.005,
     geometry: str = "auto",
+    measure_clearance: bool = False,
 ) -> Verification:
     """Check a path for limits, collision and self-collision.
 
@@ -41,6 +43,8 @@ def verify_path(
         step: largest distance between checked configurations [rad] (Euclidean over joints).
         geometry: "meshes" for the true collision geometry, "spheres" for the robot's covering
             spheres, "auto" for meshes where this machine has them.
+        measure_clearance: also measure the smallest distance to obstacles, which takes many times
+            as long.
 
     Raises:
         ValueError: the path has the wrong shape or is not finite, ``step`` is not positive,
@@ -50,32 +54,58 @@ def verify_path(
     if not step > 0:
         raise ValueError(f"step is {step}; expected a positive number [rad], such as 0.005")
     exact = exact_scene(robot, obstacles, geometry=geometry)
-    configurations, fractions = interpolate(robot, path, step)
+    walk = interpolate(robot, path, step)
     # Contacts are asked for up to the first configuration outside the limits.
-    outside = _outside_limits(robot, configurations)
-    first_outside = int(outside.any(1).argmax()) if outside.any() else len(configurations)
-    clearance, contact, checked = np.inf, None, 0
-    for q, fraction in zip(configurations[:first_outside], fractions, strict=False):
-        checked += 1
-        if pairs := exact.touching(q):
-            contact = f"{exact.describe(pairs[0])} at {100 * fraction:.0f} % of the path"
-        clearance = exact.clearance(clearance)
-        if contact:
-            break
+    outside = _outside_limits(robot, walk.q)
+    first_outside = int(outside.any(1).argmax()) if outside.any() else len(walk.q)
+    contact, checked = _first_contact(exact, walk, first_outside)
+    clearance = float("nan")
+    if measure_clearance and obstacles and first_outside:
+        clearance = _smallest_clearance(exact, walk.q[:first_outside])
     if contact is None and outside.any():
         joint = int(outside[first_outside].argmax())
         contact = (
-            f"{robot.joint_names[joint]} = {configurations[first_outside, joint]:.4f} is outside "
+            f"{robot.joint_names[joint]} = {walk.q[first_outside, joint]:.4f} is outside "
             f"[{robot.lower[joint]:.4f}, {robot.upper[joint]:.4f}] "
-            f"at {100 * fractions[first_outside]:.0f} % of the path"
+            f"at {100 * walk.fraction[first_outside]:.0f} % of the path"
         )
     return Verification(
         ok=contact is None,
-        clearance=float(clearance) if obstacles and checked else float("nan"),
+        clearance=clearance,
         geometry=exact.geometry,
         checked=checked,
         contact=contact,
     )
+
+
+def _first_contact(exact: ExactScene, walk: "Walk", end: int) -> tuple[str | None, int]:
+    """What touches first among the first ``end`` configurations, and how many were looked at.
+
+    Those that the robot cannot have reached a contact at, for the distances before, are left out.
+    """
+    index, checked, segment, speeds = 0, 0, -1, np.zeros((0, 0))
+    while index < end:
+        checked += 1
+        near = exact.near(walk.q[index])
+        if np.any(near[0] < 0):
+            pair = exact.touching(walk.q[index])[0]
+            share = 100 * walk.fraction[index]
+            return f"{exact.describe(pair)} at {share:.0f} % of the path", checked
+        if walk.segment[index] != segment:
+            segment = walk.segment[index]
+            speeds = exact.speeds(walk.turn[segment])
+        # Skip what is certainly free, but not beyond the next waypoint.
+        steps = int(exact.free_span(near, speeds) * walk.steps[segment])
+        index = min(index + max(steps, 1), walk.first[segment + 1])
+    return None, checked
+
+
+def _smallest_clearance(exact: ExactScene, configurations: np.ndarray) -> float:
+    clearance = np.inf
+    for q in configurations:
+        exact.near(q)
+        clearance = exact.clearance(clearance)
+    return float(clearance)
 
 
 def check_path(robot: Robot, world: World, path: np.ndarray, *, step: float) -> CheckedPath:
@@ -90,7 +120,7 @@ def check_path(robot: Robot, world: World, path: np.ndarray, *, step: float) -> 
     path = unwrapped(world, path)
     return CheckedPath(
         path=path,
-        trajectory=interpolate(robot, path, step)[0].astype(np.float32),
+        trajectory=interpolate(robot, path, step).q.astype(np.float32),
         verification=verify_path(robot, obstacle_list(world), path, step=step),
     )
 
@@ -130,24 +160,41 @@ def _checked_path(robot: Robot, path: np.ndarray) -> np.ndarray:
     return path
 
 
-def interpolate(robot: Robot, path: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Configurations (n, D) along the path, ends included, and their share (n,) of its length."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Walk:
+    """A path in small steps. Letters: ``n`` configurations, ``P`` waypoints."""
+
+    q: np.ndarray  # (n, D), ends included
+    fraction: np.ndarray  # (n,) of the path's length so far
+    segment: np.ndarray  # (n,) int segment that begins or goes on there
+    turn: np.ndarray  # (P, D) of each segment; zero after the last waypoint
+    steps: np.ndarray  # (P,) int into which each segment is divided
+    first: np.ndarray  # (P + 1,) int configuration at which each segment begins; then n
+
+
+def interpolate(robot: Robot, path: np.ndarray, step: float) -> Walk:
+    """A path (P, D) in equal steps on each segment, none longer than ``step`` [rad]."""
     turns = np.diff(path, axis=0)
     # Turns by more than pi take the shorter direction. A turn by pi, up to rounding, does not.
     around = robot.is_continuous & (np.abs(turns) > np.pi + _HALF_TURN_TOLERANCE)
-    turns -= 2 * np.pi * np.round(turns / (2 * np.pi)) * around
-    # Each segment is divided into equal steps; the first configuration is the path's first.
+    turns = turns - 2 * np.pi * np.round(turns / (2 * np.pi)) * around
     lengths = np.linalg.norm(turns, axis=1)
-    rows, traveled = [path[:1]], [np.zeros(1)]
-    for start, turn, before, length in zip(
-        path, turns, np.cumsum(lengths) - lengths, lengths, strict=False
-    ):
-        count = max(int(np.ceil(length / step)), 1)
-        part = np.arange(1, count + 1) / count
-        rows.append(start + part[:, None] * turn)
-        traveled.append(before + part * length)
-    total = max(lengths.sum(), 1e-12)
-    return np.concatenate(rows), np.concatenate(traveled) / total
+    steps = np.maximum(np.ceil(lengths / step), 1).astype(int)
+    # A segment's configurations are its beginning and the steps after it, but not its end.
+    segment = np.repeat(np.arange(len(turns)), steps)
+    first = np.concatenate([[0], np.cumsum(steps)]).astype(int)
+    part = (np.arange(len(segment)) - first[segment]) / steps[segment]
+    q = path[segment] + part[:, None] * turns[segment]
+    traveled = np.cumsum(lengths)[segment] - lengths[segment] * (1 - part)
+    end = path[-1] if not len(turns) else path[-2] + turns[-1]
+    return Walk(
+        q=np.concatenate([q, end[None]]),
+        fraction=np.append(traveled / max(lengths.sum(), 1e-12), 1.0 if len(turns) else 0.0),
+        segment=np.append(segment, len(turns)),
+        turn=np.concatenate([turns, np.zeros((1, path.shape[1]))]),
+        steps=np.append(steps, 1),
+        first=np.append(first, first[-1] + 1),
+    )
 
 
 def _outside_limits(robot: Robot, configurations: np.ndarray) -> np.ndarray:

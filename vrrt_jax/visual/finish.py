@@ -216,7 +216,7 @@ def _straight(
     exact_scene(robot, obstacles)  # built once, and no part of any search
     started = time.perf_counter()
     path = np.stack([q_start, q_goal])
-    seen = verify_path(robot, obstacles, path, step=SWEEP_STEP)
+    seen = verify_path(robot, obstacles, path, step=SWEEP_STEP, measure_clearance=True)
     clear = seen.ok and not seen.clearance < world.margin + SWEEP_MARGIN
     if clear and overrides_is_free(world):
         edge = world.edge(jnp.asarray(path[:1]), jnp.asarray(path[1:]))

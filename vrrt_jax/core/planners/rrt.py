@@ -93,8 +93,7 @@ class RRT(PytreeSubclasses):
         # The first lane of all tries the straight edge from the start to the goal.
         at_goal = at_goal.at[0].set(at_goal[0] | (tree.iteration == 0))
         aim = jnp.where(at_goal[:, None], goal.q, aim)
-        parent = jnp.argmin(trees.distances(world, tree, aim), axis=1)
-        return parent.astype(jnp.int32), aim
+        return trees.nearest(world, tree, aim), aim
 
     def with_sub_steps(
         self, world: Space, tree: Tree, parent: jax.Array, q: jax.Array, valid: jax.Array

@@ -13,6 +13,7 @@ from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
 
+RECENT = 4  # iterations whose nodes may still be fresh
 SAME = 1e-4  # [rad] configurations nearer than this are one
 
 
@@ -44,16 +45,22 @@ class RRTConnect:
     A node that arrives scores 0.
     """
 
-    MAX_STEP: ClassVar[float] = 0.64  # [rad]
+    MAX_STEP: ClassVar[float] = 0.64  # [rad] of extending lanes
+    MAX_CONNECTION: ClassVar[float] = 2.56  # [rad] of connecting lanes
 
     margin: Any = 1.0  # how far from the ends half of the samples are drawn [rad]
     lanes: int = static(default=32)
-    edge_steps: int = static(default=32)
+    edge_steps: int = static(default=32)  # longest edge of a connecting lane, in sub-steps
+    extend_steps: int = static(default=0)  # of an extending lane; 0 for as many
 
     @classmethod
     def for_world(cls, world: Space, **settings: Any) -> Self:
         """The planner with steps of the same length, however fine the world's checks are."""
-        return cls(edge_steps=num_checks(world, cls.MAX_STEP), **settings)
+        steps = {
+            "edge_steps": num_checks(world, cls.MAX_CONNECTION),
+            "extend_steps": num_checks(world, cls.MAX_STEP),
+        }
+        return cls(**(steps | settings))
 
     def init(
         self, world: Space, goal: ConfigurationGoal, q_roots: Any, capacity: int
@@ -83,15 +90,18 @@ class RRTConnect:
     ) -> Proposals:
         """Connect the newest fresh nodes; extend with all other lanes."""
         lane = jnp.arange(self.lanes)
-        index = jnp.arange(tree.capacity)
         node = tree.payload
 
-        # The second half of the lanes connects: one fresh node each, the newest first.
-        waiting = node.fresh & trees.occupied(tree)
-        newest, chosen = jax.lax.top_k(jnp.where(waiting, index, -1), self.lanes // 2)
+        # The second half of the lanes connects: one fresh node each, the newest first. Among the
+        # latest nodes there are enough of them: an iteration adds more than can be connected.
+        num = min(RECENT * self.lanes, tree.capacity)
+        first = jnp.clip(tree.size - num, 0, tree.capacity - num)
+        recent = first + jnp.arange(num, dtype=jnp.int32)
+        waiting = jax.lax.dynamic_slice(node.fresh, (first,), (num,)) & (recent < tree.size)
+        newest, _ = jax.lax.top_k(jnp.where(waiting, recent, -1), self.lanes // 2)
         half = self.lanes - self.lanes // 2
         connects = jnp.concatenate([jnp.zeros(half, bool), newest >= 0])
-        chosen = jnp.concatenate([jnp.zeros(half, jnp.int32), chosen.astype(jnp.int32)])
+        chosen = jnp.concatenate([jnp.zeros(half, jnp.int32), newest])
 
         # The others extend towards samples. Half of the samples are near the two ends: where
         # limits are far apart, few others serve.
@@ -111,12 +121,15 @@ class RRTConnect:
         # from the nearest node of its own tree to its sample; these take turns between the trees.
         aim = jnp.where(connects[:, None], tree.q[chosen], sample)
         side = jnp.where(connects, 1 - node.side[chosen], lane % 2)
-        distances = trees.distances(world, tree, aim, among=node.side == side[:, None])
-        nearest = jnp.argmin(distances, axis=1).astype(jnp.int32)
+        nearest = trees.nearest(world, tree, aim, label=node.side, wanted=side)
         parent = jnp.where(connects, chosen, nearest)
+
+        # A connecting lane goes as far as it is free to; an extending lane takes one step.
+        step = world.steer(tree.q[nearest], aim, self.extend_steps or self.edge_steps)
+        extended = world.end(tree.q[nearest], step)
         return Proposals(
             parent=parent,
-            target=jnp.where(connects[:, None], tree.q[nearest], aim),
+            target=jnp.where(connects[:, None], tree.q[nearest], extended),
             valid=jnp.ones(self.lanes, bool),
             partial=jnp.ones(self.lanes, bool),
             aux=ConnectLanes(
