@@ -36,7 +36,7 @@ ADVICE = {
     Status.NO_MATCH: "raise max_expansions",
     Status.NO_PATH: "raise max_expansions",
     Status.MAX_ITERATIONS: "raise max_expansions",
-    Status.TREE_FULL: "raise capacity",
+    Status.TREE_FULL: "raise max_capacity",
     Status.TIME_LIMIT: "raise time_limit_s",
     Status.INTERRUPTED: "run it again",
     Status.NOT_VERIFIED: "lower the world's resolution",
@@ -115,6 +115,7 @@ def plan(
                 key=jax.random.fold_in(key, attempt),
                 termination=make_termination(policy.goal_score(goal), max_iterations=iterations),
                 time_limit_s=left_s,
+                max_capacity=config.max_capacity,
                 on_progress=on_progress,
             )
             results.append(_finish(scene, world, goal, policy, found, start, key))

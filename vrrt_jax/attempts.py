@@ -75,6 +75,7 @@ def attempt(
         key=key,
         termination=termination_of(config, policy, problem.goal),
         time_limit_s=time_left(config, seed_s).budget.time_limit_s,
+        max_capacity=config.tree.max_capacity,
         on_progress=on_progress,
     )
     found = dataclasses.replace(

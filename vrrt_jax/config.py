@@ -13,7 +13,8 @@ class TreeConfig:
     """The tree: its size, and how it is rewired. Changes of the first four re-compile."""
 
     lanes: int = setting(32, 2, 4096)  # expansions an iteration
-    capacity: int = setting(8192, 8)  # nodes
+    capacity: int = setting(8192, 8)  # nodes that there is room for at first
+    max_capacity: int = setting(1 << 20, 8)  # a full tree gets more room, up to this
     image_px: int = setting(64, 8, 4096)  # image height that is searched at
     rewiring: bool = True  # RRT*
     rewire_radius: float = setting(0.3, 0.0)  # [rad]
@@ -141,6 +142,11 @@ def check_config(config: PlannerConfig) -> None:
         )
     settings.check_settings(config)
     lanes, roots = config.tree.lanes, 2 + min(config.seeds.num, config.seeds.kept)
+    if config.tree.capacity > config.tree.max_capacity:
+        raise ValueError(
+            f"tree.capacity={config.tree.capacity} is above tree.max_capacity="
+            f"{config.tree.max_capacity}; lower the first or raise the second"
+        )
     if config.tree.capacity < lanes + roots:
         raise ValueError(
             f"tree.capacity={config.tree.capacity} leaves no room for {roots - 1} roots and one "

@@ -19,9 +19,9 @@ ADVICE = {
     Status.NO_MATCH: (
         "check the camera and the self-model, add a view, or raise budget.max_iterations"
     ),
-    Status.NO_PATH: "raise budget.connect_iterations and tree.capacity, or move the obstacles",
+    Status.NO_PATH: "raise budget.connect_iterations, or move the obstacles",
     Status.MAX_ITERATIONS: "raise budget.max_iterations",
-    Status.TREE_FULL: "raise tree.capacity",
+    Status.TREE_FULL: "raise tree.max_capacity",
     Status.TIME_LIMIT: "raise budget.time_limit_s",
     Status.INTERRUPTED: "run it again",
     Status.NOT_VERIFIED: "lower the world's resolution or raise its margin",
@@ -30,7 +30,7 @@ ADVICE = {
 # The same of a plan to a joint goal, where it differs.
 JOINT_ADVICE = ADVICE | {
     Status.NO_MATCH: "raise budget.max_iterations",
-    Status.NO_PATH: "raise budget.max_iterations and tree.capacity, or move the obstacles",
+    Status.NO_PATH: "raise budget.max_iterations, or move the obstacles",
 }
 
 

@@ -271,6 +271,7 @@ def plan_batch(
             key=keys,
             termination=_stack(terminations),
             time_limit_s=time_left(config, sum(seed_s)).budget.time_limit_s,
+            max_capacity=config.tree.max_capacity,
             batched=True,
             on_progress=on_progress,
         )
@@ -310,6 +311,7 @@ def _plan_to_configuration(
             policy.goal_score(goal), max_iterations=config.budget.max_iterations
         ),
         time_limit_s=config.budget.time_limit_s,
+        max_capacity=config.tree.max_capacity,
         on_progress=on_progress,
     )
     path = policy.extract_path(found.tree)

@@ -118,7 +118,7 @@ def test_same_key_same_plan(solve):
 
 def test_budget_and_capacity(solve):
     assert solve("rrt", max_expansions=32, goal_bias=0.0).status is Status.MAX_ITERATIONS
-    assert solve("rrt-is", capacity=64, goal_bias=0.0).status is Status.TREE_FULL
+    assert solve("rrt-is", capacity=64, max_capacity=64, goal_bias=0.0).status is Status.TREE_FULL
 
 
 def test_rrt_connect_counts_the_lanes_it_takes(solve, monkeypatch):

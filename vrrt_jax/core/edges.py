@@ -16,7 +16,9 @@ from vrrt_jax.core.types import pytree
 
 Edge = Any
 
-CHECKS = 64  # configurations that are checked at once, of all edges together
+# Configurations that are checked at once, of all edges together: many where most edges will have to
+# be followed, few where most will be given up.
+CHECKS, FEW_CHECKS = 64, 32
 
 
 class Space(Protocol):
@@ -244,7 +246,8 @@ def free_prefix(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) -> 
     Returns:
         (B,) i32 number of leading sub-steps that are free; S where the whole edge is.
     """
-    return _first_blocked(world, q_from, edge, num_steps, lambda step, first: step < first)
+    checks = _check(world, q_from, edge, num_steps, lambda checks, step: step < checks.first)
+    return checks.first[:, 0]
 
 
 def is_edge_free(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) -> jax.Array:
@@ -253,26 +256,58 @@ def is_edge_free(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) ->
     An edge costs nothing more once something is found on it.
     """
     whole = num_steps
-    first = _first_blocked(world, q_from, edge, whole, lambda step, first: first == whole)
-    return first == whole
+    checks = _check(world, q_from, edge, whole, lambda checks, step: checks.first == whole)
+    return checks.first[:, 0] == whole
+
+
+def first_free_edge(
+    world: Space, q_from: jax.Array, edge: Edge, num_steps: int, tried: jax.Array
+) -> jax.Array:
+    """The first of B edges along which nothing is touched, () i32; B if there is none.
+
+    Edges after one that is known to be free cost nothing more.
+
+    Args:
+        world: what to collide with.
+        q_from: (B, D) starts, taken to be free; the ends are too.
+        edge: of B lanes, the most wanted first.
+        num_steps: S sub-steps along each edge.
+        tried: (B,) bool, which edges count.
+    """
+    lanes = q_from.shape[0]
+    lane = jnp.arange(lanes)[:, None]
+
+    def first_free(checks: _Checks) -> jax.Array:
+        is_free = jnp.all(checks.known, axis=1) & (checks.first[:, 0] == num_steps) & tried
+        return jnp.where(jnp.any(is_free), jnp.argmax(is_free), lanes)
+
+    def matters(checks: _Checks, step: jax.Array) -> jax.Array:
+        is_open = (checks.first == num_steps) & tried[:, None]
+        return is_open & (lane < first_free(checks)) & (step < num_steps - 1)
+
+    few = FEW_CHECKS
+    checks = _check(world, q_from, edge, num_steps, matters, ends_known=True, batch=few)
+    return first_free(checks)
 
 
 @pytree
 class _Checks:
     known: jax.Array  # (B, S) bool, checked or known to be free
-    first: jax.Array  # (B,) i32 the first sub-step known to be blocked, S if none is
+    first: jax.Array  # (B, 1) i32 the first sub-step known to be blocked, S if none is
 
 
-def _first_blocked(
+def _check(
     world: Space,
     q_from: jax.Array,
     edge: Edge,
     num_steps: int,
-    matters: Callable[[jax.Array, jax.Array], jax.Array],
-) -> jax.Array:
-    """The first blocked sub-step (B,) i32 of B edges, S where all that matter are free.
+    matters: Callable[[_Checks, jax.Array], jax.Array],
+    ends_known: bool = False,
+    batch: int = CHECKS,
+) -> _Checks:
+    """Check sub-steps of B edges until none that matters is left.
 
-    Ends and middles first: what is found there spares the checks between. A batch of checks is
+    Ends and middles come first: what is found there spares the checks between. A batch of checks is
     what is left of the coarsest levels, of all edges together.
 
     Args:
@@ -280,16 +315,18 @@ def _first_blocked(
         q_from: (B, D).
         edge: of B lanes.
         num_steps: S.
-        matters: of the indices (S,) of sub-steps and the first (B, 1) blocked so far, whether
-            (B, S) a sub-step still has to be checked.
+        matters: of the checks so far and the indices (S,) of sub-steps, whether (B, S) a sub-step
+            still has to be checked.
+        ends_known: the ends are taken to be free.
+        batch: sub-steps that are checked at once.
     """
     lanes, step = q_from.shape[0], jnp.arange(num_steps)
     order = jnp.asarray(_coarse_to_fine(num_steps))
-    batch = min(CHECKS, lanes * num_steps)
+    batch = min(batch, lanes * num_steps)
 
     def open_checks(checks: _Checks) -> jax.Array:
         """Which sub-steps have to be checked, (S * B,) the coarsest first."""
-        needed = ~checks.known & matters(step, checks.first[:, None])
+        needed = ~checks.known & matters(checks, step)
         return needed[:, order].T.reshape(-1)
 
     def check(checks: _Checks) -> _Checks:
@@ -305,7 +342,7 @@ def _first_blocked(
         span = jax.vmap(world.free_span)(world.end(q_from[lane], part), edges)
         # Book what is blocked, and all sub-steps within the free spans.
         blocked = valid & ~(span >= 0)
-        first = checks.first.at[jnp.where(blocked, lane, lanes)].min(at, mode="drop")
+        first = checks.first.at[jnp.where(blocked, lane, lanes), 0].min(at, mode="drop")
         reach = jnp.minimum(jnp.maximum(span, 0.0) * num_steps, num_steps).astype(jnp.int32)
         lane = jnp.where(valid, lane, lanes)
         change = jnp.zeros((lanes, num_steps + 1), jnp.int32)
@@ -315,9 +352,10 @@ def _first_blocked(
         return _Checks(known=checks.known | covered, first=first)
 
     start = _Checks(
-        known=jnp.zeros((lanes, num_steps), bool), first=jnp.full(lanes, num_steps, jnp.int32)
+        known=jnp.broadcast_to(ends_known & (step == num_steps - 1), (lanes, num_steps)),
+        first=jnp.full((lanes, 1), num_steps, jnp.int32),
     )
-    return jax.lax.while_loop(lambda checks: jnp.any(open_checks(checks)), check, start).first
+    return jax.lax.while_loop(lambda checks: jnp.any(open_checks(checks)), check, start)
 
 
 def _coarse_to_fine(num: int) -> np.ndarray:

@@ -94,6 +94,10 @@ def initial_state(tree: Tree) -> SearchState:
     )
 
 
+_initial = jax.jit(initial_state)
+_initials = jax.jit(jax.vmap(initial_state))
+
+
 def stop_reason(state: SearchState, termination: Termination) -> jax.Array:
     """The :class:`StopReason` code () that holds, -1 while the search should go on."""
     tree = state.tree
@@ -173,7 +177,7 @@ def search(
             when all have.
         on_progress: called with the state and the seconds so far after every chunk.
     """
-    state = (jax.vmap(initial_state) if batched else initial_state)(tree)
+    state = (_initials if batched else _initial)(tree)
     advance = partial(_chunks if batched else _chunk, world, goal, policy)
     compile_s = _compile(advance, state, termination, key)
     history = [_record(state, 0.0)]

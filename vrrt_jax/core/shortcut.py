@@ -4,26 +4,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.edges import Edge, Space, distance, free_prefix
+from vrrt_jax.core.edges import Edge, Space, distance, first_free_edge
 from vrrt_jax.core.types import pytree
 
-LANES = 32
-COARSE_STEPS = 16  # sub-steps of a first check of every candidate
-CHECKED = 4  # of those that pass it, the ones that save most are checked to the end
+LANES = 16  # candidates in a round
+PATIENCE = 6  # idle rounds after which it stops
+CHECKED = 8  # of those, the ones that save most are checked
 EDGE_STEPS = 128  # sub-steps of a candidate, so the longest is 128 times the resolution
 GAIN = 1e-3  # [rad] smallest saving worth a new corner
+PAYS = 2e-3  # share of the length; rounds that save less count as idle
 
 
 @pytree
 class _Path:
     q: jax.Array  # (P, D), the last waypoint repeated beyond ``size``
     size: jax.Array  # () i32
-    idle: jax.Array  # () i32 rounds since the last success
+    idle: jax.Array  # () i32 rounds since one that paid
     round: jax.Array  # () i32
 
 
 def shortcut(
-    world: Space, path: np.ndarray, *, key: jax.Array, rounds: int = 150, patience: int = 20
+    world: Space, path: np.ndarray, *, key: jax.Array, rounds: int = 150, patience: int = PATIENCE
 ) -> np.ndarray:
     """Shorten a collision-free path; the ends stay.
 
@@ -35,7 +36,7 @@ def shortcut(
         path: (P, D) waypoints.
         key: random key.
         rounds: at most so many.
-        patience: stop after so many rounds without a saving.
+        patience: stop after so many rounds in a row that hardly pay.
 
     Returns:
         (P', D) waypoints.
@@ -74,32 +75,28 @@ def _round(world: Space, path: _Path, key: jax.Array) -> _Path:
     q_ends, at = world.end(path.q[index], parts), along[index] + world.length(parts)
     q_a, q_b = q_ends[:, 0], q_ends[:, 1]
 
-    # Straight edges between them. Those that save nothing are cut to length zero.
+    # Straight edges between them, those that save most first. The first free one is taken.
     direct = world.edge(q_a, q_b)
     saving = at[:, 1] - at[:, 0] - world.length(direct)
-    tried = (saving > GAIN) & world.is_resolved(direct, EDGE_STEPS)
-    direct = world.truncate(direct, tried.astype(q_a.dtype))
-    # Check all coarsely, and the few that save most to the end.
-    coarse = free_prefix(world, q_a, direct, COARSE_STEPS) == COARSE_STEPS
-    saving, lane = jax.lax.top_k(jnp.where(tried & coarse, saving, 0.0), CHECKED)
-    free = free_prefix(world, q_a[lane], _rows(direct, lane), EDGE_STEPS) == EDGE_STEPS
-    saving = jnp.where(free, saving, 0.0)
+    size = index[:, 0] + 3 + path.size - (index[:, 1] + 1)
+    tried = (saving > GAIN) & world.is_resolved(direct, EDGE_STEPS) & (size <= path.q.shape[0])
+    saving, lane = jax.lax.top_k(jnp.where(tried, saving, 0.0), CHECKED)
+    row = first_free_edge(world, q_a[lane], _rows(direct, lane), EDGE_STEPS, saving > 0)
+    found = row < CHECKED
+    best = lane[jnp.minimum(row, CHECKED - 1)]
 
-    # Splice the best one in: its two ends become waypoints between the edges that they lie on.
-    most = jnp.argmax(saving)
-    best = lane[most]
-    first, last = index[best, 0], index[best, 1]
-    size = first + 3 + path.size - (last + 1)
-    found = (saving[most] > 0) & (size <= path.q.shape[0])
+    # Splice it in: its two ends become waypoints between the edges that they lie on.
+    first, last, size = index[best, 0], index[best, 1], size[best]
     place = jnp.arange(path.q.shape[0])
     source = jnp.where(place <= first, place, place - (first + 3) + last + 1)
     spliced = path.q[jnp.clip(source, 0, path.q.shape[0] - 1)]
     spliced = jnp.where((place == first + 1)[:, None], world.normalize(q_a[best]), spliced)
     spliced = jnp.where((place == first + 2)[:, None], world.normalize(q_b[best]), spliced)
+    pays = found & (saving[jnp.minimum(row, CHECKED - 1)] > PAYS * along[-1])
     return _Path(
         q=jnp.where(found, spliced, path.q),
         size=jnp.where(found, size, path.size),
-        idle=jnp.where(found, 0, path.idle + 1),
+        idle=jnp.where(pays, 0, path.idle + 1),
         round=path.round + 1,
     )
 

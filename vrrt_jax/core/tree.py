@@ -17,13 +17,13 @@ UNREACHED = 1e3  # [rad] cost of a root that is not known to be reachable from t
 
 
 def create(
-    q: jax.Array,
-    score: jax.Array,
+    q: np.ndarray,
+    score: np.ndarray,
     payload: Payload,
     capacity: int,
-    cost: jax.Array | float = 0.0,
+    cost: np.ndarray | float = 0.0,
 ) -> Tree[Payload]:
-    """A tree, or a forest of R roots.
+    """A tree, or a forest of R roots; made on the host.
 
     Args:
         q: (R, D) root configurations.
@@ -34,25 +34,29 @@ def create(
     """
     roots = q.shape[0]
 
-    def padded(leaf: jax.Array, fill) -> jax.Array:
-        leaf = jnp.asarray(leaf)
-        return jnp.full((capacity, *leaf.shape[1:]), fill, leaf.dtype).at[:roots].set(leaf)
+    def padded(leaf: jax.Array, fill: float) -> np.ndarray:
+        # On the host, where a dozen small operations cost nothing.
+        values = np.asarray(leaf)
+        column = np.full((capacity, *values.shape[1:]), fill, values.dtype)
+        column[:roots] = values
+        return column
 
-    return Tree(
+    tree = Tree(
         q=padded(q, 0),
-        parent=jnp.full(capacity, -1, jnp.int32),
-        cost=padded(jnp.broadcast_to(jnp.asarray(cost, q.dtype), roots), 0),
-        score=padded(score, jnp.inf),
-        size=jnp.int32(roots),
-        iteration=jnp.int32(0),
-        rejected=jnp.zeros(len(Rejection), jnp.int32),
+        parent=np.full(capacity, -1, np.int32),
+        cost=padded(np.broadcast_to(np.asarray(cost, q.dtype), roots), 0),
+        score=padded(score, np.inf),
+        size=np.int32(roots),
+        iteration=np.int32(0),
+        rejected=np.zeros(len(Rejection), np.int32),
         payload=jax.tree.map(lambda leaf: padded(leaf, 0), payload),
     )
+    return jax.device_put(tree)
 
 
-def root_costs(num: int) -> jax.Array:
+def root_costs(num: int) -> np.ndarray:
     """Costs (num,) of roots: 0 for the start, :data:`UNREACHED` for the others."""
-    return jnp.full(num, UNREACHED).at[0].set(0.0)
+    return np.where(np.arange(num) == 0, 0.0, UNREACHED).astype(np.float32)
 
 
 def insert(

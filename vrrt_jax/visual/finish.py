@@ -251,6 +251,7 @@ def _connect(
             policy.goal_score(goal), max_iterations=config.budget.connect_iterations
         ),
         time_limit_s=time_left(config, found.search_s).budget.time_limit_s,
+        max_capacity=config.tree.max_capacity,
     )
     found = dataclasses.replace(
         found,

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from core_cases import GOAL, START
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -123,3 +124,20 @@ def test_insertion_equals_a_loop(ok, capacity):
     assert int(grown.size) == len(expected)
     np.testing.assert_array_equal(grown.q[: len(expected)], expected)
     assert np.all(np.isinf(grown.score[len(expected) :]))
+
+
+@pytest.mark.parametrize("size", [1, 511, 512, 700, 1300])
+def test_nearest_nodes_are_found_block_by_block(wall_world, rng, size):
+    capacity, aim = 1300, rng.uniform(-2, 2, (5, 7)).astype(np.float32)
+    nodes = rng.uniform(-2, 2, (size, 7)).astype(np.float32)
+    tree = trees.create(nodes, np.zeros(size), None, capacity)
+    label = jnp.asarray(rng.integers(0, 2, capacity))
+    wanted = jnp.array([0, 1, 0, 1, 7])
+    apart = np.linalg.norm(nodes - aim[:, None], axis=2)
+    np.testing.assert_array_equal(
+        jax.jit(trees.nearest)(wall_world, tree, aim), apart.argmin(axis=1)
+    )
+    apart[np.asarray(label)[:size] != np.asarray(wanted)[:, None]] = np.inf
+    np.testing.assert_array_equal(
+        jax.jit(trees.nearest)(wall_world, tree, aim, label, wanted), apart.argmin(axis=1)
+    )

@@ -37,7 +37,7 @@ def test_interrupt_keeps_the_tree(wall_world, monkeypatch):
 def test_budget_capacity_and_time_are_reported(wall_world):
     goal, policy = ConfigurationGoal(q=jnp.asarray(GOAL)), RRT(goal_bias=0.0)
 
-    def run(capacity, limit=float("inf"), **changes):
+    def run(capacity, limit=float("inf"), max_capacity=4096, **changes):
         return search(
             wall_world,
             goal,
@@ -46,12 +46,57 @@ def test_budget_capacity_and_time_are_reported(wall_world):
             key=jax.random.key(0),
             termination=make_termination(-1.0, **{"max_iterations": 10_000, **changes}),
             time_limit_s=limit,
+            max_capacity=max_capacity,
         )
 
-    full = run(100)
+    full = run(100, max_capacity=100)
     assert full.stopped is StopReason.TREE_FULL and int(full.tree.size) == 100
     assert int(full.tree.rejected[Rejection.CAPACITY]) > 0
     few = run(4096, max_iterations=3)
     assert few.stopped is StopReason.ITERATIONS and int(few.tree.iteration) == 3
     assert run(4096, limit=0.0).stopped is StopReason.TIME_LIMIT
     assert run(4096, patience=5, min_improvement=1e9).stopped is StopReason.CONVERGED
+
+
+def test_a_full_tree_gets_more_room(wall_world, free):
+    goal, policy = ConfigurationGoal(q=jnp.asarray(GOAL)), RRT(goal_bias=0.0)
+    found = search(
+        wall_world,
+        goal,
+        policy,
+        policy.init(wall_world, goal, START[None], 40),
+        key=jax.random.key(0),
+        termination=make_termination(-1.0, max_iterations=20),
+        max_capacity=4096,
+    )
+    size, tree = int(found.tree.size), found.tree
+    assert found.stopped is StopReason.ITERATIONS and size > 160 and tree.capacity == 640
+    parent = np.asarray(tree.parent)
+    assert parent[0] == -1 and np.all((parent[1:size] >= 0) & (parent[1:size] < size))
+    assert np.all(parent[size:] == -1) and np.all(np.isinf(np.asarray(tree.score)[size:]))
+    # Costs of nodes from before and after are lengths of their edges, and all nodes are free.
+    q, cost = np.asarray(tree.q), np.asarray(tree.cost)
+    length = np.linalg.norm(q[1:size] - q[parent[1:size]], axis=1)
+    np.testing.assert_allclose(cost[1:size], cost[parent[1:size]] + length, rtol=1e-4)
+    assert np.all(np.asarray(free(wall_world, q[:size])))
+
+
+def test_trees_of_a_batch_grow_together(wall_world):
+    goal, policy = ConfigurationGoal(q=jnp.asarray(GOAL)), RRT(goal_bias=0.0)
+    tree = policy.init(wall_world, goal, START[None], 40)
+
+    def twice(leaf):
+        return jnp.stack([jnp.asarray(leaf)] * 2)
+
+    found = search(
+        wall_world,
+        jax.tree.map(twice, goal),
+        policy,
+        jax.tree.map(twice, tree),
+        key=jax.random.split(jax.random.key(0)),
+        termination=jax.tree.map(twice, make_termination(-1.0, max_iterations=6)),
+        max_capacity=4096,
+        batched=True,
+    )
+    assert found.stopped_each == (StopReason.ITERATIONS,) * 2
+    assert found.tree.q.shape == (2, 160, 7) and np.all(np.asarray(found.tree.size) > 40)

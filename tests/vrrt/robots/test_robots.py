@@ -3,12 +3,13 @@
 import warnings
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from vrrt_jax.robots import load_robot, mesh_sources, packaged
-from vrrt_jax.robots.kinematics import body_links, link_poses
+from vrrt_jax.robots.kinematics import body_links, lever_arms, link_poses, place, placement
 
 POSE_TOLERANCE = 1e-5  # float32 over seven joints; worst seen 6e-7
 
@@ -423,3 +424,19 @@ def test_no_meshes_anywhere_is_none(panda, monkeypatch):
 def test_scenes_folder_has_the_robots():
     assert (packaged.scenes_dir() / "robots" / "panda" / "robot.xml").is_file()
     assert "panda" in packaged.robot_names()
+
+
+@pytest.mark.parametrize("name", ["panda", "fetch"])
+def test_lever_arms_bound_how_far_spheres_move(name, rng):
+    robot = load_robot(name)
+    spheres = robot.collision_spheres
+    link, center = np.asarray(spheres.link), np.asarray(spheres.center)
+    arms = lever_arms(robot.chain, link, center, robot.lower, robot.upper)
+    matrix = placement(link, center, robot.chain.num_links)
+    moved = jax.jit(
+        jax.vmap(jax.jacfwd(lambda q: place(jnp.asarray(matrix), link_poses(robot.chain, q))))
+    )(rng.uniform(robot.lower, robot.upper, (300, robot.num_joints)).astype(np.float32))
+    most = np.linalg.norm(np.asarray(moved), axis=1).max(axis=0).T  # (D, n)
+    assert np.all(most <= arms + 1e-5)
+    # The bound is not much longer than what some configuration reaches.
+    assert np.median(arms[arms > 0.05] / most[arms > 0.05]) < 1.3

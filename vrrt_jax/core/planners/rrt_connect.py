@@ -50,8 +50,8 @@ class RRTConnect:
 
     margin: Any = 1.0  # how far from the ends half of the samples are drawn [rad]
     lanes: int = static(default=32)
-    edge_steps: int = static(default=32)  # longest edge of a connecting lane, in sub-steps
-    extend_steps: int = static(default=0)  # of an extending lane; 0 for as many
+    edge_steps: int = static(default=128)  # longest edge of a connecting lane, in sub-steps
+    extend_steps: int = static(default=32)  # of an extending lane
 
     @classmethod
     def for_world(cls, world: Space, **settings: Any) -> Self:
@@ -73,12 +73,12 @@ class RRTConnect:
         if self.lanes < 2:
             raise ValueError(f"RRT-Connect has {self.lanes} lanes; expected 2 or more")
         ends = ConnectNode(
-            side=jnp.array([0, 1], jnp.int32),
-            fresh=jnp.array([True, True]),
-            meets=jnp.array([-1, -1], jnp.int32),
+            side=np.array([0, 1], np.int32),
+            fresh=np.array([True, True]),
+            meets=np.array([-1, -1], np.int32),
         )
-        q = jnp.stack([jnp.asarray(q_roots)[0], jnp.asarray(goal.q)])
-        far = jnp.full(2, jnp.finfo(jnp.float32).max)
+        q = np.stack([np.asarray(q_roots)[0], np.asarray(goal.q)]).astype(np.float32)
+        far = np.full(2, np.finfo(np.float32).max)
         return trees.create(q, far, ends, capacity)
 
     def goal_score(self, goal: ConfigurationGoal) -> float:
@@ -125,7 +125,7 @@ class RRTConnect:
         parent = jnp.where(connects, chosen, nearest)
 
         # A connecting lane goes as far as it is free to; an extending lane takes one step.
-        step = world.steer(tree.q[nearest], aim, self.extend_steps or self.edge_steps)
+        step = world.steer(tree.q[nearest], aim, self.extend_steps)
         extended = world.end(tree.q[nearest], step)
         return Proposals(
             parent=parent,
