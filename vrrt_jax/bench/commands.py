@@ -30,6 +30,7 @@ def add_bench(kinds: Any) -> None:
         ("ablation", "the settings, varied one by one"),
     ):
         _add_protocol(kinds.add_parser(what, help=words), what)
+    _add_arm(kinds.add_parser("arm", help="joint goals, on files of problems from elsewhere"))
 
 
 def add_robot(parser: argparse.ArgumentParser, required: bool = True) -> None:
@@ -63,6 +64,27 @@ def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument("--occluded", action="store_true", help="obstacles hide the robot")
     parser.add_argument("--time-limit", type=float, default=60.0, help="of one search [s]")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--json", help="write results here; go on from what it holds")
+
+
+def _add_arm(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(run=_arm)
+    parser.add_argument(
+        "--problems", required=True, help="a folder of .npz files, or one that holds ROBOT/*.npz"
+    )
+    add_robot(parser)
+    parser.add_argument(
+        "--base",
+        type=command.numbers,
+        help="where the robot's base link stands in the files, as --base=x,y,z,yaw [m, rad]",
+    )
+    parser.add_argument("--planner", default="rrt-connect", help="rrt-connect, rrt or rrt-star")
+    parser.add_argument("--engine", help="of collision; the usual one by default")
+    parser.add_argument("--limit", type=int, help="problems of each file, evenly taken")
+    parser.add_argument("--batch", type=int, help="measure the rate of batches of so many too")
+    parser.add_argument("--peers", action="store_true", help="OMPL's planners too")
+    parser.add_argument("--seed", type=int, default=0, help="of all plans")
+    parser.add_argument("--time-limit", type=float, default=60.0, help="of one search [s]")
     parser.add_argument("--json", help="write results here; go on from what it holds")
 
 
@@ -112,6 +134,25 @@ def _protocol(arguments: argparse.Namespace) -> int:
         **chosen,
     )
     print(tables.to_text(runner.run(benchmark, arguments.json, jobs=arguments.jobs)))
+    return EXIT_SOLVED
+
+
+def _arm(arguments: argparse.Namespace) -> int:
+    from vrrt_jax.bench import arm, arm_table
+    from vrrt_jax.bench.arm_problems import problem_files
+    from vrrt_jax.config import PlannerConfig
+    from vrrt_jax.robots import load_robot
+
+    robot = load_robot(arguments.robot, freeze=arguments.freeze)
+    files = problem_files(arguments.problems, robot.name)
+    benchmark = arm.ArmBenchmark(
+        robot=robot,
+        config=PlannerConfig().changed({"budget.time_limit_s": arguments.time_limit}),
+        base=None if arguments.base is None else tuple(arguments.base.tolist()),
+        **{name: getattr(arguments, name) for name in ("planner", "engine", "limit", "batch")},
+        **{name: getattr(arguments, name) for name in ("peers", "seed")},
+    )
+    print(arm_table.to_text(arm.run(benchmark, files, arguments.json)))
     return EXIT_SOLVED
 
 
