@@ -90,7 +90,7 @@ def run(
     _check_done(results["scenes"], problems)
     # One world for all: its slots are refilled, so that nothing compiles twice.
     most = max(len(obstacles) for own in problems for obstacles in own.obstacles)
-    settings = {} if benchmark.engine is None else {"engine": benchmark.engine}
+    settings: dict[str, Any] = {} if benchmark.engine is None else {"engine": benchmark.engine}
     world = build_world(benchmark.robot, [], num_slots=most, **settings)
     for own in problems:
         if own.differences:

@@ -4,10 +4,11 @@ A file is a NumPy archive of ``N`` problems. ``docs/benchmarks.md`` lists its ke
 """
 
 import dataclasses
-import pickle
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -121,11 +122,14 @@ def read_problems(
 def _read(file: Path) -> dict[str, np.ndarray]:
     """The arrays of a file, with keys, types and shapes checked."""
     try:
-        with np.load(file, allow_pickle=False) as archive:
+        archive = np.load(file, allow_pickle=False)
+        if isinstance(archive, np.ndarray):
+            raise ValueError("it is a single array")
+        with archive:
             arrays = {key: archive[key] for key in archive.files}
     except FileNotFoundError:
         raise FileNotFoundError(f"no problems at '{file}'; give a .npz file") from None
-    except (ValueError, OSError, AttributeError, zipfile.BadZipFile, pickle.PickleError) as error:
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(
             f"'{file}' is no NumPy archive of plain arrays ({error}); expected one that "
             "numpy.savez wrote"
@@ -152,13 +156,15 @@ def _check(file: Path, key: str, array: np.ndarray, letters: str, sizes: dict[st
     if array.dtype.kind not in kinds:
         wanted = {"U": "text", "b": "bool", "fiu": "numbers"}[kinds]
         raise ValueError(f"'{file}': {key} is of type {array.dtype}; expected {wanted}")
+    sizes |= {letter: int(letter) for letter in letters if letter.isdigit()}
     if array.ndim == len(letters):
         for letter, size in zip(letters, array.shape, strict=True):
-            sizes.setdefault(letter, int(letter) if letter.isdigit() else size)
-    wanted = tuple(sizes.get(letter, letter) for letter in letters)
-    if array.shape != wanted:
+            sizes.setdefault(letter, size)
+    wanted = [str(sizes.get(letter, letter)) for letter in letters]
+    if list(map(str, array.shape)) != wanted:
         raise ValueError(
-            f"'{file}': {key} has shape {array.shape}; expected ({', '.join(letters)}) = {wanted}"
+            f"'{file}': {key} has shape {array.shape}; expected ({', '.join(letters)}) = "
+            f"({', '.join(wanted)})"
         )
     if kinds == "fiu" and not np.isfinite(array).all():
         where = np.argwhere(~np.isfinite(array))[0].tolist()
@@ -233,8 +239,8 @@ class _Frame:
         rotation = _rotation(base.xquat) * _rotation(base_pose[3:]).inv()
         return cls(rotation=rotation, shift=base.xpos - rotation.apply(base_pose[:3]))
 
-    def pose(self, pose: np.ndarray) -> dict[str, tuple[float, ...]]:
-        """Position and quaternion of a pose (7,) of the file."""
+    def pose(self, pose: np.ndarray) -> dict[str, Any]:
+        """Fields ``position`` and ``quaternion`` of a pose (7,) of the file."""
         turned = self.rotation * _rotation(pose[3:])
         return {
             "position": floats(self.rotation.apply(pose[:3]) + self.shift),
@@ -249,10 +255,10 @@ def _rotation(quaternion: np.ndarray) -> Rotation:
 def _base_pose(arrays: Mapping[str, np.ndarray], base: Sequence[float] | None) -> np.ndarray | None:
     if base is None:
         return arrays.get("base_pose")
-    base = np.asarray(base, float)
-    if base.shape != (4,) or not np.isfinite(base).all():
-        raise ValueError(f"the base is {base.tolist()}; expected x, y, z [m] and yaw [rad]")
-    return np.array([*base[:3], np.cos(base[3] / 2), 0.0, 0.0, np.sin(base[3] / 2)])
+    if len(base) != 4 or not np.isfinite(base).all():
+        raise ValueError(f"the base is {list(base)}; expected x, y, z [m] and yaw [rad]")
+    *position, yaw = base
+    return np.array([*position, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
 
 
 def _obstacles(

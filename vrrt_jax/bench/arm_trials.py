@@ -218,10 +218,11 @@ def batch_rate(
 
     def plan(number: int) -> int:
         batch = batches[number]
+        worlds: Any = [trial.world for trial in batch]
         with uninterrupted():
             results = planner.plan_batch(
                 robot,
-                [trial.world for trial in batch],
+                worlds,
                 [ConfigurationGoal(q=trial.q_goal) for trial in batch],
                 np.stack([trial.q_start for trial in batch]),
                 key=jax.random.fold_in(jax.random.key(seed), number),
@@ -241,7 +242,7 @@ def _compilations() -> list[int]:
     """One number: how many programs this process has compiled since the first call."""
     count = [0]
 
-    def on_duration(event: str, duration_s: float, **_: Any) -> None:
+    def on_duration(event: str, duration_secs: float, **_: Any) -> None:
         count[0] += event == _COMPILED
 
     jax.monitoring.register_event_duration_secs_listener(on_duration)

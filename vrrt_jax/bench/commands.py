@@ -148,7 +148,7 @@ def _arm(arguments: argparse.Namespace) -> int:
     benchmark = arm.ArmBenchmark(
         robot=robot,
         config=PlannerConfig().changed({"budget.time_limit_s": arguments.time_limit}),
-        base=None if arguments.base is None else tuple(arguments.base.tolist()),
+        base=None if arguments.base is None else tuple(round(float(x), 6) for x in arguments.base),
         **{name: getattr(arguments, name) for name in ("planner", "engine", "limit", "batch")},
         **{name: getattr(arguments, name) for name in ("peers", "seed")},
     )

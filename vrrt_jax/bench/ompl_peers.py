@@ -109,7 +109,8 @@ def _setup(robot: Robot, trial: Trial, ompl: Any) -> Any:
     ends = []
     for q in (trial.q_start, trial.q_goal):
         state = space.allocState()
-        state[0 : robot.num_joints] = [float(value) for value in q]
+        # An end on a limit is beyond it by a rounding error, which OMPL would refuse.
+        state[0 : robot.num_joints] = np.clip(q, robot.lower, robot.upper).tolist()
         ends.append(state)
     setup.setStartAndGoalStates(*ends)
     return setup
@@ -137,5 +138,5 @@ def _ompl(seed: int) -> Any:
     import ompl.util
 
     ompl.util.RNG.setSeed(seed + 1)  # zero would be a random one
-    ompl.util.setLogLevel(ompl.util.LogLevel.LOG_ERROR)
+    ompl.util.setLogLevel(ompl.util.LogLevel.LOG_NONE)
     return ompl
