@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -132,10 +133,7 @@ def _run_scene(benchmark: ArmBenchmark, world: World, problems: ArmProblems) -> 
         "config": benchmark.config,
         "seed": benchmark.seed,
     }
-
-    def ours(trial: Trial) -> dict[str, Any]:
-        return arm_trials.solve(robot, trial, **settings)
-
+    ours = partial(arm_trials.solve, robot, **settings)
     if trials:  # the first plan compiles, and is planned again with the others
         ours(trials[0])
     rows = _rows(trials, ours, problems.name)
@@ -154,15 +152,11 @@ def _run_scene(benchmark: ArmBenchmark, world: World, problems: ArmProblems) -> 
     if benchmark.peers:
         scene["peers"] = {}
         for name in ompl_peers.PEERS:
-
-            def peer(trial: Trial, name: str = name) -> dict[str, Any]:
-                return ompl_peers.solve(robot, trial, name, seed=benchmark.seed)
-
+            peer = partial(ompl_peers.solve, robot, name=name, seed=benchmark.seed)
             peer_rows = _rows(trials, peer, f"{problems.name}, {name}")
             scene["peers"][name] = {
                 **summarize(peer_rows),
                 "found": sum(row["found"] for row in peer_rows),
-                "raw_cost": _median(row["raw_cost"] for row in peer_rows),
                 "rows": _rounded(peer_rows),
             }
     scene["rows"] = _rounded(rows)
@@ -187,8 +181,8 @@ def summarize(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     Returns:
         ``solved``, ``failed``, and of all that were tried the times ``median_ms``, ``p95_ms``,
-        ``search_median_ms`` and ``stages_ms``; ``cost`` is the median of what was solved. None
-        where there is nothing to tell.
+        ``search_median_ms`` and ``stages_ms``; ``cost`` is the median of what was solved,
+        ``raw_cost`` that before it was shortened. None where there is nothing to tell.
     """
     walls = [row["wall_ms"] for row in rows]
     names = rows[0]["stages_ms"] if rows else ()
@@ -202,6 +196,7 @@ def summarize(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "p95_ms": round(float(np.quantile(walls, 0.95)), 2) if walls else None,
         "search_median_ms": stages.get("search"),
         "stages_ms": stages,
+        "raw_cost": _median(row["raw_cost"] for row in rows),
         "cost": _median(row["cost"] for row in rows),
     }
 

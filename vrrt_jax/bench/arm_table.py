@@ -15,6 +15,7 @@ HEADS = (
     "search [ms]",
     "shorten [ms]",
     "verify [ms]",
+    "raw cost [rad]",
     "cost [rad]",
     "batch [1/s]",
 )
@@ -35,7 +36,7 @@ def to_text(results: Mapping[str, Any]) -> str:
                     f"{summary['solved']}/{planned}",
                     *(_number(summary[name]) for name in ("median_ms", "p95_ms")),
                     *(_number(stages.get(name)) for name in ("search", "shortcut", "verify")),
-                    _number(summary["cost"], 2),
+                    *(_number(summary[name], 2) for name in ("raw_cost", "cost")),
                     _number(summary.get("batch_problems_per_s")),
                 ]
             )

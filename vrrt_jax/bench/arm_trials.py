@@ -16,6 +16,7 @@ from vrrt_jax.bench.arm_problems import ArmProblems
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.interrupt import uninterrupted
+from vrrt_jax.core.shortcut import path_length
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.obstacles import Obstacle
@@ -152,7 +153,7 @@ def solve(
 
     Returns:
         A row: ``index``, ``status``, ``solved``, ``wall_ms`` of the whole call, ``stages_ms``,
-        ``cost`` [rad], ``held_left_out`` and ``recompiled``.
+        ``cost`` [rad], ``raw_cost`` before shortening, ``held_left_out`` and ``recompiled``.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed meanwhile.
@@ -185,6 +186,7 @@ def solve(
         "stages_ms": {
             stage: 1e3 * result.timing[f"{stage}_s"] for stage in ("search", "shortcut", "verify")
         },
+        "raw_cost": path_length(trial.world, result.raw_path) if result.ok else None,
         "cost": result.cost if result.ok else None,
         "held_left_out": trial.held_left_out,
         "recompiled": recompiled,

@@ -41,7 +41,7 @@ def settings() -> dict[str, Any]:
     }
 
 
-def solve(robot: Robot, trial: Trial, name: str, *, seed: int) -> dict[str, Any]:
+def solve(robot: Robot, trial: Trial, *, name: str, seed: int) -> dict[str, Any]:
     """Plan once with a planner of OMPL, and check its path exactly.
 
     Joints that turn forever have bounds of a half turn either way here.
@@ -89,8 +89,8 @@ def solve(robot: Robot, trial: Trial, name: str, *, seed: int) -> dict[str, Any]
         "found": found,
         "wall_ms": 1e3 * sum(stages.values()),
         "stages_ms": {stage: 1e3 * seconds for stage, seconds in stages.items()},
+        "raw_cost": raw_cost if verified else None,
         "cost": cost if verified else None,
-        "raw_cost": raw_cost,
     }
 
 
