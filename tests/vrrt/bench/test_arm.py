@@ -3,6 +3,7 @@
 import importlib.util
 import json
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -390,6 +391,16 @@ def test_a_plan_in_a_moved_frame_is_valid(panda, arrays, write, capsys):
     assert row["cost"] > 1.2  # around the post, which is in the way there too
     assert main([*command, "--base=0,0,0,0", "--limit", "1", "--json", str(results)]) == 2
     assert "not mixed" in capsys.readouterr().err
+
+
+def test_compilations_are_counted():
+    count = arm_trials._compilations()
+    double = jax.jit(lambda x: 2.5 * x)
+    before = count[0]
+    double(1.0)
+    once = count[0]
+    double(2.0)
+    assert once > before and count[0] == once
 
 
 def test_without_ompl_the_peers_say_what_to_install(panda, monkeypatch):
