@@ -84,8 +84,8 @@ def held_at_goal(robot: Robot, obstacles: Sequence[Obstacle], q_goal: np.ndarray
     """Which obstacle the fingers hold at the goal, if they hold one.
 
     C MuJoCo says what touches what, with the true meshes and with the spheres that cover them. An
-    obstacle is held if it is small, and if it and the hand (all bodies that the last joint carries)
-    are all that touches.
+    obstacle is held if it is small, and if the hand (all bodies that the last joint carries)
+    touches it and no other body does. Whatever else touches there is no matter of this function.
 
     Args:
         robot: from :func:`vrrt_jax.load_robot`.
@@ -93,19 +93,21 @@ def held_at_goal(robot: Robot, obstacles: Sequence[Obstacle], q_goal: np.ndarray
         q_goal: (D,) [rad] or [m].
 
     Returns:
-        The obstacle's index, or None.
+        The obstacle's index; None if there is no such obstacle, or more than one.
     """
-    hand, touched = _hand_bodies(robot), set()
+    bodies: dict[int, set[str]] = {}  # that touch an obstacle, by its index
     for geometry in ("auto", "spheres"):
         scene = exact_scene(robot, obstacles, geometry=geometry)
         for first, second in scene.touching(q_goal):
-            if second < scene.num_bodies or scene.model.body(first).name not in hand:
-                return None
-            touched.add(second - scene.num_bodies)
-    if len(touched) != 1:
-        return None
-    (index,) = touched
-    return index if _longest_edge(obstacles[index]) <= LARGEST_HELD else None
+            if second >= scene.num_bodies:
+                index = second - scene.num_bodies
+                bodies.setdefault(index, set()).add(scene.model.body(first).name)
+    held = [
+        index
+        for index, touching in bodies.items()
+        if _longest_edge(obstacles[index]) <= LARGEST_HELD and touching <= _hand_bodies(robot)
+    ]
+    return held[0] if len(held) == 1 else None
 
 
 @functools.lru_cache(maxsize=8)
