@@ -1,13 +1,13 @@
 """The ``vrrt`` command: plan, render, fit, spheres, bench, report, worlds."""
 
 import argparse
-import json
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from vrrt_jax.bench.commands import add_bench, add_robot
 from vrrt_jax.core import command
 from vrrt_jax.core.command import EXIT_SOLVED, EXIT_UNSOLVED
 
@@ -26,11 +26,13 @@ def _parser() -> argparse.ArgumentParser:
     plan = commands.add_parser("plan", help="plan a packaged problem, or one of your own")
     plan.set_defaults(run=_plan)
     plan.add_argument("--problem", help="a packaged problem, or a folder with problem.json")
-    _add_robot(plan, required=False)
+    add_robot(plan, required=False)
     plan.add_argument("--world", help="an MJCF file of obstacles, or a packaged world")
     plan.add_argument("--goal", nargs="+", help="goal images, RGB with mask or plain background")
     plan.add_argument("--camera", nargs="+", help="a JSON file for each goal image")
-    plan.add_argument("--start", type=_numbers, help="start configuration, as --start=0,0.3,...")
+    plan.add_argument(
+        "--start", type=command.numbers, help="start configuration, as --start=0,0.3,..."
+    )
     plan.add_argument("--self-model", help="trained .npz; the robot's own by default")
     plan.add_argument("--seed", type=int, default=0, help="of all that is random")
     plan.add_argument("--time-limit", type=float, default=60.0, help="of the search [s]")
@@ -41,15 +43,17 @@ def _parser() -> argparse.ArgumentParser:
 
     render = commands.add_parser("render", help="make a goal image with MuJoCo's renderer")
     render.set_defaults(run=_render)
-    _add_robot(render)
-    render.add_argument("--q", type=_numbers, required=True, help="configuration, as --q=0,0.3,...")
+    add_robot(render)
+    render.add_argument(
+        "--q", type=command.numbers, required=True, help="configuration, as --q=0,0.3,..."
+    )
     render.add_argument("--camera", required=True, help="a JSON file")
     render.add_argument("--size", type=_size, default=(480, 480), help="WIDTHxHEIGHT [px]")
     render.add_argument("--out", required=True, help="a .png file")
 
     fit = commands.add_parser("fit", help="train a robot's self-model")
     fit.set_defaults(run=_fit)
-    _add_robot(fit)
+    add_robot(fit)
     fit.add_argument("--out", required=True, help="a .npz file")
     fit.add_argument("--seed", type=int, default=0, help="of poses, cameras and splats")
     fit.add_argument("--images", type=int, help="number of training images")
@@ -57,28 +61,13 @@ def _parser() -> argparse.ArgumentParser:
 
     spheres = commands.add_parser("spheres", help="fit collision spheres to a robot's meshes")
     spheres.set_defaults(run=_spheres)
-    _add_robot(spheres)
+    add_robot(spheres)
     spheres.add_argument("--out", help="the MJCF file to write; only measured without it")
     spheres.add_argument("--seed", type=int, default=0, help="of fit and measurement")
     spheres.add_argument("--num", type=int, default=10_000, help="configurations to measure on")
 
     bench = commands.add_parser("bench", help="measure speed, success or settings")
-    kinds = bench.add_subparsers(dest="what", required=True)
-    for what in ("kinematics", "raster", "search"):
-        speed = kinds.add_parser(what, help="how fast this machine is")
-        speed.set_defaults(run=_speed)
-        speed.add_argument("--json", help="write the figures here")
-    twins = kinds.add_parser("twins", help="how alike a robot looks after half a turn of its wrist")
-    twins.set_defaults(run=_twins)
-    twins.add_argument("--tasks-per-level", type=int, default=20, help="tasks at each distance")
-    twins.add_argument("--json", help="write the figures here")
-    twins.add_argument("--figure", help="draw a goal of each robot and its twin into this .png")
-    for what, words in (
-        ("visual", "the paper's tasks, among obstacles"),
-        ("pose", "recover the goal alone, without obstacles"),
-        ("ablation", "the settings, varied one by one"),
-    ):
-        _add_protocol(kinds.add_parser(what, help=words), what)
+    add_bench(bench.add_subparsers(dest="what", required=True))
 
     report = commands.add_parser("report", help="tables and figures of benchmark results")
     report.set_defaults(run=_report)
@@ -87,44 +76,11 @@ def _parser() -> argparse.ArgumentParser:
 
     worlds = commands.add_parser("worlds", help="make random worlds around a robot")
     worlds.set_defaults(run=_worlds)
-    _add_robot(worlds)
+    add_robot(worlds)
     worlds.add_argument("--num", type=int, default=6, help="worlds")
     worlds.add_argument("--seed", type=int, default=0, help="before the first world's")
     worlds.add_argument("--out", required=True, help="folder for ROBOT_1.xml and so on")
     return parser
-
-
-def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
-    parser.set_defaults(run=_protocol)
-    parser.add_argument("--robot", required=True, help="panda, ur5e or fetch")
-    levels = "0.5,1.0,1.5,2.0,2.5"
-    parser.add_argument("--levels", type=_numbers, default=levels, help="distances [rad]")
-    parser.add_argument("--tasks-per-level", type=int, default=20, help="tasks at each distance")
-    parser.add_argument("--seed", type=int, default=0, help="of tasks and plans")
-    if what == "ablation":
-        parser.add_argument("--only", help="one setting, such as eta; all by default")
-        parser.add_argument("--config", default="paper", help="whose settings: paper or default")
-    else:
-        parser.add_argument(
-            "--method", default="vrrt", help="vrrt, dr-robot, dr-robot-rrt-star or prof-robot"
-        )
-        parser.add_argument("--config", default="default", help="default or paper")
-    parser.add_argument("--views", type=int, default=1, choices=(1, 2), help="cameras")
-    parser.add_argument("--azimuth", type=float, default=0.0, help="turn the cameras [degree]")
-    parser.add_argument("--light", type=float, default=1.0, help="brightness of the lamp")
-    parser.add_argument("--occluded", action="store_true", help="obstacles hide the robot")
-    parser.add_argument("--time-limit", type=float, default=60.0, help="of one search [s]")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--json", help="write results here; go on from what it holds")
-
-
-def _add_robot(parser: argparse.ArgumentParser, required: bool = True) -> None:
-    parser.add_argument(
-        "--robot", required=required, help="a packaged robot, or an MJCF or URDF file"
-    )
-    parser.add_argument(
-        "--freeze", type=_joint_values, default=None, help="joints to fix, as name=0.04,name=0.04"
-    )
 
 
 def _plan(arguments: argparse.Namespace) -> int:
@@ -301,55 +257,6 @@ def _meshes(robot):
     return spec
 
 
-def _speed(arguments: argparse.Namespace) -> int:
-    import importlib
-
-    return _figures(importlib.import_module(f"vrrt_jax.bench.{arguments.what}").run(), arguments)
-
-
-def _twins(arguments: argparse.Namespace) -> int:
-    from vrrt_jax.bench import pose_ambiguity
-
-    if arguments.figure:
-        pose_ambiguity.draw(arguments.figure)
-    return _figures(pose_ambiguity.run(arguments.tasks_per_level), arguments)
-
-
-def _figures(figures: dict[str, Any], arguments: argparse.Namespace) -> int:
-    text = json.dumps(figures, indent=2)
-    print(text)
-    if arguments.json:
-        Path(arguments.json).write_text(text + "\n")
-    return EXIT_SOLVED
-
-
-def _protocol(arguments: argparse.Namespace) -> int:
-    from vrrt_jax.bench import protocol, runner, tables
-    from vrrt_jax.bench.tasks import Scenery
-
-    if arguments.jobs < 1:
-        raise ValueError(f"--jobs is {arguments.jobs}; expected at least 1")
-    choices = ("method", "config", "only")
-    chosen = {name: getattr(arguments, name) for name in choices if hasattr(arguments, name)}
-    benchmark = protocol.benchmark(
-        arguments.what,
-        arguments.robot,
-        levels=arguments.levels.tolist(),
-        tasks_per_level=arguments.tasks_per_level,
-        seed=arguments.seed,
-        time_limit_s=arguments.time_limit,
-        scenery=Scenery(
-            views=arguments.views,
-            azimuth_deg=arguments.azimuth,
-            light=arguments.light,
-            occluded=arguments.occluded,
-        ),
-        **chosen,
-    )
-    print(tables.to_text(runner.run(benchmark, arguments.json, jobs=arguments.jobs)))
-    return EXIT_SOLVED
-
-
 def _report(arguments: argparse.Namespace) -> int:
     from vrrt_jax.bench import tables
 
@@ -385,27 +292,11 @@ def _writable(folder: str | Path) -> Path:
     return folder
 
 
-def _numbers(text: str):
-    import numpy as np
-
-    try:
-        return np.array([float(part) for part in text.split(",")], np.float32)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a list such as 0,0.3,-1.2") from None
-
-
 def _size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
     if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
         raise argparse.ArgumentTypeError(f"'{text}' is not a size such as 480x480")
     return int(width), int(height)
-
-
-def _joint_values(text: str) -> dict[str, float]:
-    try:
-        return {k: float(v) for k, v in (part.split("=") for part in text.split(","))}
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a list such as finger=0.04") from None
 
 
 if __name__ == "__main__":

@@ -2,8 +2,6 @@
 
 import concurrent.futures
 import dataclasses
-import hashlib
-import json
 import multiprocessing
 import os
 from collections.abc import Iterator, Sequence
@@ -14,10 +12,10 @@ import numpy as np
 from tqdm import tqdm
 
 from vrrt_jax.bench.methods import CAUSES, solve
+from vrrt_jax.bench.results_file import fingerprint, plain, resume, write
 from vrrt_jax.bench.tasks import Scenery, bench_robot, make_task
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.command import end_with_parent
-from vrrt_jax.core.files import replacing
 from vrrt_jax.core.interrupt import uninterrupted
 from vrrt_jax.core.timing import machine
 from vrrt_jax.problems import self_model_path
@@ -59,9 +57,9 @@ class Benchmark:
             "format": FORMAT,
             **{name: getattr(self, name) for name in ("what", "robot", "seed")},
             "scenery": dataclasses.asdict(self.scenery),
-            "variants": [_plain(dataclasses.asdict(variant)) for variant in self.variants],
+            "variants": [plain(dataclasses.asdict(variant)) for variant in self.variants],
             "versions": versions(),
-            "self_model": _fingerprint(self_model_path(bench_robot(self.robot))),
+            "self_model": fingerprint(self_model_path(bench_robot(self.robot))),
         }
 
 
@@ -80,7 +78,9 @@ def run(benchmark: Benchmark, file: str | Path | None, *, jobs: int = 1) -> dict
         ValueError: the file holds another benchmark, version or seed.
         OSError: the file cannot be written; what it held stays.
     """
-    results = _fresh(benchmark, jobs) if file is None else _resume(benchmark, Path(file), jobs)
+    results = _fresh(benchmark, jobs)
+    if file is not None:
+        results = resume(Path(file), benchmark.header(), results)
     done = {_key(row) for row in results["tasks"]}
     todo = [
         (variant.name, level, index)
@@ -95,7 +95,7 @@ def run(benchmark: Benchmark, file: str | Path | None, *, jobs: int = 1) -> dict
             results["tasks"].append(row)
             results.update(_summary(benchmark, results["tasks"]))
             if file is not None:
-                _write(Path(file), results)
+                write(Path(file), results)
             won += row["success"]
             bar.set_postfix_str(f"{100 * won / count:.0f} % solved")
             bar.update()
@@ -156,39 +156,6 @@ def _fresh(benchmark: Benchmark, jobs: int) -> dict[str, Any]:
     return {**benchmark.header(), "machine": here, "tasks": []}
 
 
-def _resume(benchmark: Benchmark, file: Path, jobs: int) -> dict[str, Any]:
-    if not file.exists():
-        results = _fresh(benchmark, jobs)
-        _write(file, results)  # a bad path is told before hours of work
-        return results
-    try:
-        results = json.loads(file.read_text())
-        old = {name: results[name] for name in benchmark.header()}
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"'{file}' is no results file of this version ({error!r}); choose another --json"
-        ) from None
-    for name, value in benchmark.header().items():
-        if old[name] != value:
-            raise ValueError(
-                f"'{file}' has {name} {old[name]!r}, this run {value!r}: results of different "
-                "runs are not mixed; choose another --json"
-            )
-    return results
-
-
-def _write(file: Path, results: dict[str, Any]) -> None:
-    """Replace the file at once; if that fails, what it held stays."""
-    try:
-        with replacing(file, "w") as handle:
-            handle.write(json.dumps(results, indent=1) + "\n")
-    except OSError as error:
-        raise OSError(
-            f"cannot write '{file}': {error.strerror}; what it held is kept, and the same command "
-            "goes on from there"
-        ) from None
-
-
 def _summary(benchmark: Benchmark, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Success and more by level; of an ablation, by variant."""
     by_variant = {
@@ -238,13 +205,3 @@ def _mean(values) -> float | None:
 def _median(values) -> float | None:
     values = list(values)
     return round(float(np.median(values)), 3) if values else None
-
-
-def _fingerprint(file: Path) -> str:
-    """Of what is in a file."""
-    return hashlib.sha256(file.read_bytes()).hexdigest()[:12]
-
-
-def _plain(fields: dict[str, Any]) -> dict[str, Any]:
-    """What JSON gives back unchanged."""
-    return json.loads(json.dumps(fields))

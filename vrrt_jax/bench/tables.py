@@ -63,7 +63,7 @@ def to_text(results: dict[str, Any]) -> str:
         "PSNR [dB]",
         "causes of failure",
     )
-    return _table(heads, rows)
+    return table(heads, rows)
 
 
 def write_page(files: Sequence[Path], folder: Path) -> Path:
@@ -176,7 +176,7 @@ def _overview(found: Sequence[dict[str, Any]]) -> str:
                 cells.append(f"{ours}{n} / {PAPER[robot][method]}")
             settings = {True: ", paper's settings", False: ", default"}[is_paper]
             rows.append([method + (settings if method == "vrrt" else ""), *cells])
-    return _table(("method", *(f"{robot}: ours / paper" for robot in ROBOTS)), rows)
+    return table(("method", *(f"{robot}: ours / paper" for robot in ROBOTS)), rows)
 
 
 def _figure(group: Sequence[dict[str, Any]], path: Path) -> None:
@@ -274,6 +274,7 @@ def _percent(share: float | None) -> str:
     return "" if share is None else f"{100 * share:.1f}"
 
 
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
     lines = [heads, ["---"] * len(heads), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -45,6 +45,16 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
         return EXIT_INTERRUPTED
 
 
+def numbers(text: str) -> Any:
+    """An argument such as 0,0.3,-1.2 as an array (n,) of float32."""
+    import numpy as np
+
+    try:
+        return np.array([float(part) for part in text.split(",")], np.float32)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a list such as 0,0.3,-1.2") from None
+
+
 def usable_cores() -> int:
     """The number of cores that this process may use."""
     usable = getattr(os, "sched_getaffinity", None)

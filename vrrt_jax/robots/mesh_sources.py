@@ -83,6 +83,12 @@ def install_hint(mesh_source: str | None) -> str:
     return f"{source.install}, and {source.tool.install}" if source.tool else source.install
 
 
+def frozen_joints(robot: "Robot") -> dict[str, float]:
+    """Joints of the true geometry that are not planned, and where they are fixed [rad] or [m]."""
+    source = _SOURCES.get(str(robot.mesh_source))
+    return {**(source.freeze if source else {}), **robot.frozen}
+
+
 def mesh_spec(robot: "Robot", *, visuals: bool = True) -> mujoco.MjSpec | None:
     """The robot with its true geometry and the planned joints only.
 
@@ -105,7 +111,6 @@ def mesh_spec(robot: "Robot", *, visuals: bool = True) -> mujoco.MjSpec | None:
         return None
     spec = mjcf.read_spec(path, visuals=visuals)
     source = _SOURCES.get(str(robot.mesh_source))
-    fixed = source.freeze if source else {}
     if source and source.root:
         mjcf.keep_body(spec, source.root)
     if source and source.tool and source.tool.root:
@@ -116,7 +121,7 @@ def mesh_spec(robot: "Robot", *, visuals: bool = True) -> mujoco.MjSpec | None:
     if source and source.hulls:
         mjcf.collide_visuals(spec)
     mjcf.strip_spec(spec, visuals=visuals)
-    mjcf.freeze_joints(spec, {**fixed, **robot.frozen})
+    mjcf.freeze_joints(spec, frozen_joints(robot))
     for first, second in source.exclude if source else ():
         spec.add_exclude(bodyname1=first, bodyname2=second)
     return spec

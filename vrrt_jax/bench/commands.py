@@ -1,0 +1,163 @@
+"""The command ``vrrt bench``: its arguments, and what it runs."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from vrrt_jax.core import command
+from vrrt_jax.core.command import EXIT_SOLVED
+
+
+def add_bench(kinds: Any) -> None:
+    """Add a parser for each kind of benchmark.
+
+    Args:
+        kinds: the sub-parsers of ``vrrt bench``.
+    """
+    for what in ("kinematics", "raster", "search"):
+        speed = kinds.add_parser(what, help="how fast this machine is")
+        speed.set_defaults(run=_speed)
+        speed.add_argument("--json", help="write the figures here")
+    twins = kinds.add_parser("twins", help="how alike a robot looks after half a turn of its wrist")
+    twins.set_defaults(run=_twins)
+    twins.add_argument("--tasks-per-level", type=int, default=20, help="tasks at each distance")
+    twins.add_argument("--json", help="write the figures here")
+    twins.add_argument("--figure", help="draw a goal of each robot and its twin into this .png")
+    for what, words in (
+        ("visual", "the paper's tasks, among obstacles"),
+        ("pose", "recover the goal alone, without obstacles"),
+        ("ablation", "the settings, varied one by one"),
+    ):
+        _add_protocol(kinds.add_parser(what, help=words), what)
+    _add_arm(kinds.add_parser("arm", help="joint goals, on files of problems from elsewhere"))
+
+
+def add_robot(parser: argparse.ArgumentParser, required: bool = True) -> None:
+    """Add the arguments that say which robot."""
+    parser.add_argument(
+        "--robot", required=required, help="a packaged robot, or an MJCF or URDF file"
+    )
+    parser.add_argument(
+        "--freeze", type=_joint_values, default=None, help="joints to fix, as name=0.04,name=0.04"
+    )
+
+
+def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
+    parser.set_defaults(run=_protocol)
+    parser.add_argument("--robot", required=True, help="panda, ur5e or fetch")
+    levels = "0.5,1.0,1.5,2.0,2.5"
+    parser.add_argument("--levels", type=command.numbers, default=levels, help="distances [rad]")
+    parser.add_argument("--tasks-per-level", type=int, default=20, help="tasks at each distance")
+    parser.add_argument("--seed", type=int, default=0, help="of tasks and plans")
+    if what == "ablation":
+        parser.add_argument("--only", help="one setting, such as eta; all by default")
+        parser.add_argument("--config", default="paper", help="whose settings: paper or default")
+    else:
+        parser.add_argument(
+            "--method", default="vrrt", help="vrrt, dr-robot, dr-robot-rrt-star or prof-robot"
+        )
+        parser.add_argument("--config", default="default", help="default or paper")
+    parser.add_argument("--views", type=int, default=1, choices=(1, 2), help="cameras")
+    parser.add_argument("--azimuth", type=float, default=0.0, help="turn the cameras [degree]")
+    parser.add_argument("--light", type=float, default=1.0, help="brightness of the lamp")
+    parser.add_argument("--occluded", action="store_true", help="obstacles hide the robot")
+    parser.add_argument("--time-limit", type=float, default=60.0, help="of one search [s]")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--json", help="write results here; go on from what it holds")
+
+
+def _add_arm(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(run=_arm)
+    parser.add_argument(
+        "--problems", required=True, help="a folder of .npz files, or one that holds ROBOT/*.npz"
+    )
+    add_robot(parser)
+    parser.add_argument(
+        "--base",
+        type=command.numbers,
+        help="where the robot's base link stands in the files, as --base=x,y,z,yaw [m, rad]",
+    )
+    parser.add_argument("--planner", default="rrt-connect", help="rrt-connect, rrt or rrt-star")
+    parser.add_argument("--engine", help="of collision; the usual one by default")
+    parser.add_argument("--limit", type=int, help="problems of each file, evenly taken")
+    parser.add_argument("--batch", type=int, help="measure the rate of batches of so many too")
+    parser.add_argument("--peers", action="store_true", help="OMPL's planners too")
+    parser.add_argument("--seed", type=int, default=0, help="of all plans")
+    parser.add_argument("--time-limit", type=float, default=60.0, help="of one search [s]")
+    parser.add_argument("--json", help="write results here; go on from what it holds")
+
+
+def _speed(arguments: argparse.Namespace) -> int:
+    import importlib
+
+    return _figures(importlib.import_module(f"vrrt_jax.bench.{arguments.what}").run(), arguments)
+
+
+def _twins(arguments: argparse.Namespace) -> int:
+    from vrrt_jax.bench import pose_ambiguity
+
+    if arguments.figure:
+        pose_ambiguity.draw(arguments.figure)
+    return _figures(pose_ambiguity.run(arguments.tasks_per_level), arguments)
+
+
+def _figures(figures: dict[str, Any], arguments: argparse.Namespace) -> int:
+    text = json.dumps(figures, indent=2)
+    print(text)
+    if arguments.json:
+        Path(arguments.json).write_text(text + "\n")
+    return EXIT_SOLVED
+
+
+def _protocol(arguments: argparse.Namespace) -> int:
+    from vrrt_jax.bench import protocol, runner, tables
+    from vrrt_jax.bench.tasks import Scenery
+
+    if arguments.jobs < 1:
+        raise ValueError(f"--jobs is {arguments.jobs}; expected at least 1")
+    choices = ("method", "config", "only")
+    chosen = {name: getattr(arguments, name) for name in choices if hasattr(arguments, name)}
+    benchmark = protocol.benchmark(
+        arguments.what,
+        arguments.robot,
+        levels=arguments.levels.tolist(),
+        tasks_per_level=arguments.tasks_per_level,
+        seed=arguments.seed,
+        time_limit_s=arguments.time_limit,
+        scenery=Scenery(
+            views=arguments.views,
+            azimuth_deg=arguments.azimuth,
+            light=arguments.light,
+            occluded=arguments.occluded,
+        ),
+        **chosen,
+    )
+    print(tables.to_text(runner.run(benchmark, arguments.json, jobs=arguments.jobs)))
+    return EXIT_SOLVED
+
+
+def _arm(arguments: argparse.Namespace) -> int:
+    from vrrt_jax.bench import arm, arm_table
+    from vrrt_jax.bench.arm_problems import problem_files
+    from vrrt_jax.config import PlannerConfig
+    from vrrt_jax.robots import load_robot
+
+    robot = load_robot(arguments.robot, freeze=arguments.freeze)
+    files = problem_files(arguments.problems, robot.name)
+    benchmark = arm.ArmBenchmark(
+        robot=robot,
+        config=PlannerConfig().changed({"budget.time_limit_s": arguments.time_limit}),
+        base=None if arguments.base is None else tuple(round(float(x), 6) for x in arguments.base),
+        **{name: getattr(arguments, name) for name in ("planner", "engine", "limit", "batch")},
+        **{name: getattr(arguments, name) for name in ("peers", "seed")},
+    )
+    print(arm_table.to_text(arm.run(benchmark, files, arguments.json)))
+    return EXIT_SOLVED
+
+
+def _joint_values(text: str) -> dict[str, float]:
+    try:
+        return {k: float(v) for k, v in (part.split("=") for part in text.split(","))}
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a list such as finger=0.04") from None
