@@ -100,7 +100,7 @@ def held_at_goal(robot: Robot, obstacles: Sequence[Obstacle], q_goal: np.ndarray
         scene = exact_scene(robot, obstacles, geometry=geometry)
         for first, second in scene.touching(q_goal):
             if second >= scene.num_bodies:
-                index = second - scene.num_bodies
+                index = scene.obstacle_index(second)
                 bodies.setdefault(index, set()).add(scene.model.body(first).name)
     held = [
         index

@@ -147,8 +147,12 @@ class ExactScene:
     def _name(self, body: int) -> str:
         if body < self.num_bodies:
             return self.compiled.model.body(body).name
+        return self.obstacles[self.obstacle_index(body)].name
+
+    def obstacle_index(self, body: int) -> int:
+        """Which of the K obstacles a body is."""
         of_body = self.compiled.model.geom_bodyid[self.obstacle_geoms]
-        return self.obstacles[int(np.flatnonzero(of_body == body)[0])].name
+        return int(np.flatnonzero(of_body == body)[0])
 
 
 def exact_scene(
