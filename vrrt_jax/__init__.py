@@ -33,6 +33,7 @@ from vrrt_jax.planner import plan, plan_batch, plan_to_configuration  # noqa: E4
 from vrrt_jax.problems import Problem, load_problem, load_world, problem_names  # noqa: E402
 from vrrt_jax.robots import Robot, load_robot, robot_names  # noqa: E402
 from vrrt_jax.robots.kinematics import link_poses  # noqa: E402
+from vrrt_jax.scene.attached import attach, detach  # noqa: E402
 from vrrt_jax.scene.closed_form import ClosedFormWorld  # noqa: E402
 from vrrt_jax.scene.obstacles import Obstacle  # noqa: E402
 from vrrt_jax.scene.verify import verify_path  # noqa: E402
@@ -88,8 +89,10 @@ __all__ = [
     "Verification",
     "VisualRRT",
     "World",
+    "attach",
     "build_world",
     "camera_from_matrix",
+    "detach",
     "difference",
     "distance",
     "is_free",

@@ -9,8 +9,9 @@ import numpy as np
 from vrrt_jax.core.check_protocols import overrides_is_free
 from vrrt_jax.robots.kinematics import Chain, link_poses
 from vrrt_jax.robots.robot import Robot
+from vrrt_jax.scene.attached import touching_spheres
 from vrrt_jax.scene.verify import contacts
-from vrrt_jax.scene.world import World, batch_is_free, obstacle_list
+from vrrt_jax.scene.world import World, batch_is_free
 from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera, SplatModel
@@ -59,9 +60,10 @@ def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.n
         )
     q = check_limits(robot, q, what)
     if not bool(batch_is_free(world, jnp.asarray(q)[None])[0]):
-        obstacles = obstacle_list(world)
-        touching = contacts(robot, obstacles, q) or contacts(
-            robot, obstacles, q, geometry="spheres"
+        touching = (
+            contacts(robot, world, q)
+            or contacts(robot, world, q, geometry="spheres")
+            or touching_spheres(world, q)
         )
         if not touching and overrides_is_free(world):
             raise ValueError(

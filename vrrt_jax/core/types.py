@@ -110,6 +110,27 @@ class TraceIgnoredNames(tuple):
         return 0
 
 
+class TraceIgnored:
+    """Something of the host that a pytree carries, such as the robot of a world.
+
+    Any two compare equal, as :class:`TraceIgnoredNames` do.
+    """
+
+    __slots__ = ("value",)
+
+    def __init__(self, value: Any = None) -> None:
+        """Carry a value."""
+        self.value = value
+
+    def __eq__(self, other: object) -> bool:
+        """Equal to any other."""
+        return isinstance(other, TraceIgnored)
+
+    def __hash__(self) -> int:
+        """One hash for all."""
+        return 0
+
+
 class Rejection(enum.IntEnum):
     """Why a lane's child did not enter the tree; indexes ``Tree.rejected``."""
 

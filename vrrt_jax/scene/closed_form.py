@@ -15,6 +15,7 @@ import numpy as np
 from vrrt_jax.core.check_protocols import overrides_is_free
 from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import Spheres, lever_arms, link_poses, place, placement
+from vrrt_jax.scene.held import HeldSpheres, together
 from vrrt_jax.scene.obstacles import signed_distances
 from vrrt_jax.scene.world import World
 
@@ -23,15 +24,18 @@ ROUNDING = 0.999  # of spans: what single precision may round
 
 @pytree
 class ClosedFormWorld(World):
-    """A world whose robot is two sets of spheres.
+    """A world whose robot is two sets of spheres, those of held objects among both.
 
     Letters: ``n`` collision spheres, ``m`` self-collision spheres.
     """
 
     collision_spheres: jax.Array  # (L * 12, 3 n) their placement, see ``kinematics.placement``
     collision_radius: jax.Array  # (n,) [m]
+    # Spheres of a held object may always be as near to obstacles as where it was gripped.
+    gripped_distance: jax.Array  # (n,) of their centers there, infinite for all others [m]
     self_collision_spheres: jax.Array  # (L * 12, 3 m) placement of these
     contact_distance: jax.Array  # (m, m) at which two of them touch, 0 for unchecked pairs [m]
+    self_margin: jax.Array  # () clearance asked of each other, part of the contact distance [m]
     # How far a collision sphere moves, and how much the distance of two self-collision spheres
     # changes, at most while one joint moves by one, see ``kinematics.lever_arms``.
     lever_arms: jax.Array  # (D, n) [m/rad] or [m/m]
@@ -40,7 +44,8 @@ class ClosedFormWorld(World):
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.is_free`."""
         poses = link_poses(self.chain, q)
-        return (self._clearance(poses) > self.margin) & (self._self_gap(poses) >= 0)
+        is_clear = jnp.min(self._clearances(poses, self.margin)) > 0
+        return is_clear & (self._self_gap(poses) >= 0)
 
     def free_span(self, q: jax.Array, edge: jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`: distances divided by the speeds of the spheres.
@@ -50,7 +55,7 @@ class ClosedFormWorld(World):
         if overrides_is_free(self):
             return super().free_span(q, edge)
         poses = link_poses(self.chain, q)
-        clearance = self._clearances(poses) - self.margin
+        clearance = self._clearances(poses, self.margin)
         # Self-collision: pairs that are not checked are infinitely far apart.
         centers = place(self.self_collision_spheres, poses)
         apart = jnp.sqrt(sum((axis[:, None] - axis[None]) ** 2 for axis in centers) + 1e-12)
@@ -67,22 +72,29 @@ class ClosedFormWorld(World):
 
     def obstacle_clearance(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.obstacle_clearance`."""
-        return self._clearance(link_poses(self.chain, q))
+        return jnp.min(self._clearances(link_poses(self.chain, q), 0.0))
+
+    def with_held_spheres(self, held: HeldSpheres) -> Self:
+        """See :meth:`vrrt_jax.scene.world.World.with_held_spheres`."""
+        bare = dataclasses.replace(self, **sphere_fields(self.robot.value, held))
+        return dataclasses.replace(bare.with_margin(float(self.self_margin)), margin=self.margin)
 
     def with_margin(self, margin: float) -> Self:
         """See :func:`vrrt_jax.scene.world.with_margin`."""
         # A contact distance of zero marks a pair that is not checked, and must stay zero.
         wider = jnp.where(self.contact_distance > 0, self.contact_distance + margin, 0.0)
-        return dataclasses.replace(self, margin=self.margin + margin, contact_distance=wider)
+        return dataclasses.replace(
+            self,
+            margin=self.margin + margin,
+            self_margin=self.self_margin + margin,
+            contact_distance=wider,
+        )
 
-    def _clearance(self, poses: jax.Array) -> jax.Array:
-        """Smallest distance () between collision spheres and obstacles [m]."""
-        return jnp.min(self._clearances(poses))
-
-    def _clearances(self, poses: jax.Array) -> jax.Array:
-        """Distances (n,) of the collision spheres to the nearest obstacle [m]."""
+    def _clearances(self, poses: jax.Array, margin: jax.Array | float) -> jax.Array:
+        """Distances (n,) of the collision spheres, larger by a margin, to obstacles [m]."""
         distances = signed_distances(self.obstacles, place(self.collision_spheres, poses))
-        return jnp.min(distances, axis=1) - self.collision_radius
+        needed = jnp.minimum(self.collision_radius + margin, self.gripped_distance)
+        return jnp.min(distances, axis=1) - needed
 
     def _self_gap(self, poses: jax.Array) -> jax.Array:
         """Smallest difference () of squared distance and squared contact distance [m^2]."""
@@ -99,30 +111,52 @@ def closed_form_world(robot: Any, fields: Mapping[str, Any]) -> ClosedFormWorld:
         robot: from :func:`vrrt_jax.load_robot`.
         fields: of :class:`vrrt_jax.scene.world.World`.
     """
-    radius = np.asarray(robot.self_collision_spheres.radius)
+    return ClosedFormWorld(**sphere_fields(robot, together([])), **fields)
+
+
+def sphere_fields(robot: Any, held: HeldSpheres) -> dict[str, jax.Array]:
+    """The fields of :class:`ClosedFormWorld` beside those of a world.
+
+    Args:
+        robot: from :func:`vrrt_jax.load_robot`.
+        held: of all that the robot holds; they come after its own.
+    """
+    # A held object is checked against all other links, and against what these hold.
     first, second = np.asarray(robot.self_collision_pairs, int).reshape(-1, 2).T
+    link, center, radius = _joined(robot.self_collision_spheres, held)
     contact_distance = np.zeros((len(radius), len(radius)), np.float32)
     contact_distance[first, second] = radius[first] + radius[second]
-
-    def arms(spheres: Spheres) -> np.ndarray:
-        link, center = np.asarray(spheres.link), np.asarray(spheres.center)
-        return lever_arms(robot.chain, link, center, robot.lower, robot.upper)
-
+    num_own = len(radius) - len(held.radius)
+    is_other = np.triu(link[:, None] != link[num_own:], 1 - num_own)
+    contact_distance[:, num_own:] = is_other * (radius[:, None] + radius[num_own:])
     # Only joints between two spheres change their distance: those that carry just one of them.
-    own = arms(robot.self_collision_spheres)
+    own = lever_arms(robot.chain, link, center, robot.lower, robot.upper)
     relative = np.where(own[:, :, None] > 0, own[:, :, None], own[:, None])
     relative[(own[:, :, None] > 0) & (own[:, None] > 0)] = 0.0
+    self_collision_spheres = placement(link, center, robot.chain.num_links)
 
-    def placed(spheres: Spheres) -> jax.Array:
-        link, center = np.asarray(spheres.link), np.asarray(spheres.center)
-        return jnp.asarray(placement(link, center, robot.chain.num_links))
+    link, center, radius = _joined(robot.collision_spheres, held)
+    unknown = np.full(len(radius) - len(held.radius), np.inf)
+    fields = {
+        "collision_spheres": placement(link, center, robot.chain.num_links),
+        "collision_radius": radius,
+        "gripped_distance": np.concatenate([unknown, held.gripped_distance]),
+        "self_collision_spheres": self_collision_spheres,
+        "contact_distance": contact_distance,
+        "self_margin": 0.0,
+        "lever_arms": lever_arms(robot.chain, link, center, robot.lower, robot.upper),
+        "relative_lever_arms": relative,
+    }
+    return {name: jnp.asarray(value, jnp.float32) for name, value in fields.items()}
 
-    return ClosedFormWorld(
-        collision_spheres=placed(robot.collision_spheres),
-        collision_radius=robot.collision_spheres.radius,
-        self_collision_spheres=placed(robot.self_collision_spheres),
-        contact_distance=jnp.asarray(contact_distance),
-        lever_arms=jnp.asarray(arms(robot.collision_spheres), jnp.float32),
-        relative_lever_arms=jnp.asarray(relative, jnp.float32),
-        **fields,
+
+def _joined(own: Spheres, held: HeldSpheres) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Links (n,), centers (n, 3) and radii (n,) of the robot's spheres and of those that it holds.
+
+    The single precision of the robot's own is kept.
+    """
+    return (
+        np.concatenate([np.asarray(own.link), held.link]),
+        np.concatenate([np.asarray(own.center), held.center.astype(np.float32)]),
+        np.concatenate([np.asarray(own.radius), held.radius.astype(np.float32)]),
     )

@@ -11,15 +11,19 @@ import numpy as np
 from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 from vrrt_jax.robots.robot import Robot
+from vrrt_jax.scene.exact_held import HELD_BITS, add_held, allowed_depths
 from vrrt_jax.scene.exact_slots import (
     ALL_BITS,
     add_slots,
     lever_arms,
+    place,
     place_obstacles,
     room_for,
     slots_of,
 )
+from vrrt_jax.scene.held import HeldObject
 from vrrt_jax.scene.obstacles import Obstacle, check_obstacle, floats
+from vrrt_jax.scene.world import World, obstacle_list
 
 _GEOMETRIES = ("auto", "meshes", "spheres")
 _FRAME_TOLERANCE = 1e-3  # [m] between the body frames of meshes and of spheres at home
@@ -38,7 +42,7 @@ class _Compiled:
     num_bodies: int  # bodies from this index on are obstacles, one each
     slots: Mapping[str, np.ndarray]  # of each kind of obstacle, its geoms
     robot_geoms: np.ndarray  # (r,) int, geoms of moving bodies that are checked against obstacles
-    lever_arms: np.ndarray  # (D, nbody, nbody) see ``exact_slots.lever_arms``
+    held_bodies: tuple[int, ...]  # bodies of the held objects
     holder: "ExactScene | None" = None  # whose obstacles stand in it now
 
 
@@ -49,12 +53,16 @@ class ExactScene:
     compiled: _Compiled
     obstacles: tuple[Obstacle, ...]  # (K,)
     obstacle_geoms: np.ndarray  # (K,) int
+    attached: tuple[HeldObject, ...]  # what the robot holds
+    allowed: np.ndarray  # (nbody, nbody) how deep bodies may be in each other [m]
 
     @property
     def model(self) -> mujoco.MjModel:
         """The model, with this scene's obstacles in place."""
         if self.compiled.holder is not self:
             place_obstacles(self.compiled.model, self.compiled.slots, self.obstacles)
+            for body, held in zip(self.compiled.held_bodies, self.attached, strict=True):
+                place(self.compiled.model, self.compiled.model.body_geomadr[body], held.obstacle)
             self.compiled.holder = self
         return self.compiled.model
 
@@ -78,12 +86,24 @@ class ExactScene:
         """(r,) int geoms of moving bodies that are checked against obstacles."""
         return self.compiled.robot_geoms
 
+    @functools.cached_property
+    def lever_arms(self) -> np.ndarray:
+        """(D, nbody, nbody) see :func:`vrrt_jax.scene.exact_slots.lever_arms`."""
+        return lever_arms(self.model)
+
     def near(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distances (c,) [m] and pairs of bodies (c, 2) that are nearer than :data:`NEAR`.
 
         Args:
-            q: (D,); negative distances are penetrations.
+            q: (D,); negative distances are penetrations. How deep an object may be in its support
+                is no penetration.
         """
+        distance, bodies = self._contacts(q)
+        if self.attached:
+            distance = distance + self.allowed[bodies[:, 0], bodies[:, 1]]
+        return distance, bodies
+
+    def _contacts(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         model, data = self.model, self.data
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
@@ -93,6 +113,20 @@ class ExactScene:
         contact = data.contact
         return contact.dist, model.geom_bodyid[contact.geom]
 
+    def depths(self, name: str, q: np.ndarray) -> dict[str, float]:
+        """How deep a held object is in obstacles at ``q`` (D,), by their names [m].
+
+        Negative where it is beside them; without those that are farther than :data:`NEAR`.
+        """
+        index = [held.obstacle.name for held in self.attached].index(name)
+        own, found = self.compiled.held_bodies[index], {}
+        for distance, pair in zip(*self._contacts(q), strict=True):
+            first, second = sorted(int(body) for body in pair)
+            if first == own and second >= self.num_bodies:
+                other = self._name(second)
+                found[other] = max(found.get(other, -np.inf), -float(distance))
+        return found
+
     def touching(self, q: np.ndarray) -> list[tuple[int, int]]:
         """Pairs of bodies, smaller index first, that penetrate each other at ``q`` (D,)."""
         distance, bodies = self.near(q)
@@ -101,7 +135,7 @@ class ExactScene:
 
     def speeds(self, turn: np.ndarray) -> np.ndarray:
         """How fast bodies approach each other at most, (nbody, nbody) [m], on a turn (D,)."""
-        return np.tensordot(np.abs(turn), self.compiled.lever_arms, 1) + 1e-9
+        return np.tensordot(np.abs(turn), self.lever_arms, 1) + 1e-9
 
     def free_span(self, near: tuple[np.ndarray, np.ndarray], speeds: np.ndarray) -> float:
         """The share of a turn after which something may touch first.
@@ -145,6 +179,8 @@ class ExactScene:
         return f"{first} touches {second}"
 
     def _name(self, body: int) -> str:
+        if body in self.compiled.held_bodies:
+            return self.attached[self.compiled.held_bodies.index(body)].obstacle.name
         if body < self.num_bodies:
             return self.compiled.model.body(body).name
         return self.obstacles[self.obstacle_index(body)].name
@@ -156,21 +192,28 @@ class ExactScene:
 
 
 def exact_scene(
-    robot: Robot, obstacles: Sequence[Obstacle], *, geometry: str = "auto"
+    robot: Robot,
+    obstacles: Sequence[Obstacle] | World,
+    *,
+    geometry: str = "auto",
+    attached: Sequence[HeldObject] = (),
 ) -> ExactScene:
     """A compiled model of robot and obstacles; the latest ones are kept.
 
     Args:
         robot: from :func:`vrrt_jax.robots.load_robot`.
-        obstacles: K primitives.
+        obstacles: K primitives, or a world with its obstacles and what the robot holds there.
         geometry: as in :func:`verify_path`.
+        attached: what the robot holds, beside what it holds in the world.
 
     Raises:
         ValueError: as :func:`verify_path`.
     """
     if geometry not in _GEOMETRIES:
         raise ValueError(f"geometry is '{geometry}'; expected one of: {', '.join(_GEOMETRIES)}")
-    names = [obstacle.name for obstacle in obstacles]
+    if isinstance(obstacles, World):
+        obstacles, attached = obstacle_list(obstacles), [*obstacles.attached, *attached]
+    names = [obstacle.name for obstacle in [*obstacles, *(held.obstacle for held in attached)]]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ValueError(
@@ -180,13 +223,23 @@ def exact_scene(
     for obstacle in obstacles:
         check_obstacle(obstacle)
     room = room_for(obstacles)
-    compiled = _build(robot, room, geometry, threading.get_ident())
+    held = tuple((held.body, held.obstacle.kind) for held in attached)
+    compiled = _build(robot, room, geometry, threading.get_ident(), held)
     taken = dict.fromkeys(compiled.slots, 0)
     geoms = []
     for obstacle in obstacles:
         geoms.append(compiled.slots[obstacle.kind][taken[obstacle.kind]])
         taken[obstacle.kind] += 1
-    return ExactScene(compiled=compiled, obstacles=obstacles, obstacle_geoms=np.array(geoms, int))
+    geoms = np.array(geoms, int)
+    bodies = compiled.model.geom_bodyid[geoms]
+    body_of = {obstacle.name: body for obstacle, body in zip(obstacles, bodies, strict=True)}
+    return ExactScene(
+        compiled=compiled,
+        obstacles=obstacles,
+        obstacle_geoms=geoms,
+        attached=tuple(attached),
+        allowed=allowed_depths(compiled.model.nbody, attached, compiled.held_bodies, body_of),
+    )
 
 
 def _hashable(obstacle: Obstacle) -> Obstacle:
@@ -201,9 +254,16 @@ def _hashable(obstacle: Obstacle) -> Obstacle:
 
 @functools.lru_cache(maxsize=16)
 def _build(
-    robot: Robot, room: tuple[tuple[str, int], ...], geometry: str, thread: int
+    robot: Robot,
+    room: tuple[tuple[str, int], ...],
+    geometry: str,
+    thread: int,
+    held: tuple[tuple[str, str], ...],
 ) -> _Compiled:
-    """The robot with room for obstacles; every thread has its own, as MuJoCo's data demands."""
+    """The robot with room for obstacles; every thread has its own, as MuJoCo's data demands.
+
+    ``held`` are bodies and the kinds of what each of them holds.
+    """
     spec = None if geometry == "spheres" else mesh_spec(robot, visuals=False)
     if spec is None and geometry == "meshes":
         raise ValueError(
@@ -217,6 +277,7 @@ def _build(
     if has_meshes:
         _check_same_robot(robot, spec.copy().compile(), spheres.compile())
         _exclude(spec, robot.ignored_pairs)
+    held_names = add_held(spec, held, HELD_BITS["meshes" if has_meshes else "spheres"])
     num_bodies = len(spec.bodies)
     # Collision spheres see bit 0 only, and self-collision spheres see no obstacle.
     add_slots(spec, room, bits=ALL_BITS if has_meshes else 1)
@@ -224,11 +285,14 @@ def _build(
     model = spec.compile()
     # Contacts are reported from afar. Trees of boxes inside bodies are of no use to slots.
     model.geom_margin[:] = NEAR
+    model.pair_margin[:] = NEAR
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
     # Which geoms are measured against obstacles for the clearance.
     sees_obstacles = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     if not has_meshes:
         sees_obstacles = model.geom_group == int(mjcf_writer.COLLISION_GEOM["group"])
+    held_bodies = tuple(model.body(name).id for name in held_names)
+    sees_obstacles |= np.isin(model.geom_bodyid, held_bodies)
     sees_obstacles &= model.geom_bodyid < num_bodies
     is_moving = model.body_weldid[model.geom_bodyid] != 0
     return _Compiled(
@@ -238,7 +302,7 @@ def _build(
         num_bodies=num_bodies,
         slots=slots_of(model, num_bodies),
         robot_geoms=np.flatnonzero(sees_obstacles & is_moving),
-        lever_arms=lever_arms(model),
+        held_bodies=held_bodies,
     )
 
 

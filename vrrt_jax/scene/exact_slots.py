@@ -64,23 +64,27 @@ def place_obstacles(
     for kind, geoms in slots.items():
         standing = [obstacle for obstacle in obstacles if obstacle.kind == kind]
         for geom, obstacle in zip(geoms, standing, strict=False):
-            body = model.geom_bodyid[geom]
-            quaternion = np.asarray(obstacle.quaternion, float)
-            model.body_pos[body] = obstacle.position
-            model.body_quat[body] = quaternion / np.linalg.norm(quaternion)
-            if kind == "plane":
-                continue  # it has no end
-            size = np.zeros(3)
-            size[: KINDS[kind].num_sizes] = obstacle.size[: KINDS[kind].num_sizes]
-            model.geom_size[geom] = size
-            # What MuJoCo's compiler derives from the size: the box around it and its radius.
-            half = _half_extents(kind, size)
-            model.geom_aabb[geom] = [0.0, 0.0, 0.0, *half]
-            model.geom_rbound[geom] = _radius(kind, size)
-            model.bvh_aabb[model.body_bvhadr[body]] = model.geom_aabb[geom]
+            place(model, geom, obstacle)
         empty = model.geom_bodyid[geoms[len(standing) :]]
         model.body_pos[empty] = _PARKED
         model.body_quat[empty] = [1.0, 0.0, 0.0, 0.0]
+
+
+def place(model: mujoco.MjModel, geom: int, obstacle: Obstacle) -> None:
+    """Give a geom of the obstacle's kind, alone on its body, the obstacle's pose and size."""
+    body = model.geom_bodyid[geom]
+    quaternion = np.asarray(obstacle.quaternion, float)
+    model.body_pos[body] = obstacle.position
+    model.body_quat[body] = quaternion / np.linalg.norm(quaternion)
+    if obstacle.kind == "plane":
+        return  # it has no end
+    size, num_sizes = np.zeros(3), KINDS[obstacle.kind].num_sizes
+    size[:num_sizes] = obstacle.size[:num_sizes]
+    model.geom_size[geom] = size
+    # What MuJoCo's compiler derives from the size: the box around it and its radius.
+    model.geom_aabb[geom] = [0.0, 0.0, 0.0, *_half_extents(obstacle.kind, size)]
+    model.geom_rbound[geom] = _radius(obstacle.kind, size)
+    model.bvh_aabb[model.body_bvhadr[body]] = model.geom_aabb[geom]
 
 
 def lever_arms(model: mujoco.MjModel) -> np.ndarray:

@@ -15,7 +15,7 @@ from vrrt_jax.core.result import Verification
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.exact import ExactScene, exact_scene
 from vrrt_jax.scene.obstacles import Obstacle
-from vrrt_jax.scene.world import World, obstacle_list
+from vrrt_jax.scene.world import World
 
 _LIMIT_TOLERANCE = 1e-5  # [rad] or [m], paths come in float32
 _HALF_TURN_TOLERANCE = 1e-4  # [rad]
@@ -23,7 +23,7 @@ _HALF_TURN_TOLERANCE = 1e-4  # [rad]
 
 def verify_path(
     robot: Robot,
-    obstacles: Sequence[Obstacle],
+    obstacles: Sequence[Obstacle] | World,
     path: np.ndarray,
     *,
     step: float = 0.005,
@@ -37,7 +37,7 @@ def verify_path(
 
     Args:
         robot: from :func:`vrrt_jax.robots.load_robot`.
-        obstacles: K primitives.
+        obstacles: K primitives, or a world with its obstacles and what the robot holds there.
         path: (P, D) configurations joined by straight lines [rad] or [m]. Joints that wrap take the
             shorter direction. A turn by exactly pi follows the sign of the difference.
         step: largest distance between checked configurations [rad] (Euclidean over joints).
@@ -60,7 +60,7 @@ def verify_path(
     first_outside = int(outside.any(1).argmax()) if outside.any() else len(walk.q)
     contact, checked = _first_contact(exact, walk, first_outside)
     clearance = float("nan")
-    if measure_clearance and obstacles and first_outside:
+    if measure_clearance and exact.obstacles and first_outside:
         clearance = _smallest_clearance(exact, walk.q[:first_outside])
     if contact is None and outside.any():
         joint = int(outside[first_outside].argmax())
@@ -113,7 +113,7 @@ def check_path(robot: Robot, world: World, path: np.ndarray, *, step: float) -> 
 
     Args:
         robot: from :func:`vrrt_jax.robots.load_robot`.
-        world: the obstacles.
+        world: the obstacles, and what the robot holds.
         path: (P, D) waypoints; joints that wrap go on, so that waypoints can be interpolated.
         step: largest distance between checked configurations [rad].
     """
@@ -121,18 +121,18 @@ def check_path(robot: Robot, world: World, path: np.ndarray, *, step: float) -> 
     return CheckedPath(
         path=path,
         trajectory=interpolate(robot, path, step).q.astype(np.float32),
-        verification=verify_path(robot, obstacle_list(world), path, step=step),
+        verification=verify_path(robot, world, path, step=step),
     )
 
 
 def contacts(
-    robot: Robot, obstacles: Sequence[Obstacle], q: np.ndarray, *, geometry: str = "auto"
+    robot: Robot, obstacles: Sequence[Obstacle] | World, q: np.ndarray, *, geometry: str = "auto"
 ) -> list[str]:
     """What touches what at one configuration.
 
     Args:
         robot: from :func:`vrrt_jax.robots.load_robot`.
-        obstacles: K primitives.
+        obstacles: K primitives, or a world, as in :func:`verify_path`.
         q: (D,) joint positions [rad] or [m].
         geometry: as in :func:`verify_path`.
 

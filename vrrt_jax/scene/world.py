@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.edges import StraightLineEdges
-from vrrt_jax.core.types import PytreeSubclasses, TraceIgnoredNames, pytree, static
+from vrrt_jax.core.types import PytreeSubclasses, TraceIgnored, TraceIgnoredNames, pytree, static
 from vrrt_jax.robots.kinematics import Chain
+from vrrt_jax.scene.held import HeldSpheres
 from vrrt_jax.scene.obstacles import Obstacle, Obstacles, floats, from_slots, to_slots
 
 _NO_ENGINE = (
@@ -46,6 +47,8 @@ class World(PytreeSubclasses, StraightLineEdges):
     obstacle_names: TraceIgnoredNames = static()  # (K,) '' in empty slots
     kinds: TraceIgnoredNames = static()  # (K,) '' in empty slots
     colors: TraceIgnoredNames = static()  # (K,) rgba, () in empty slots
+    robot: TraceIgnored = static(default=TraceIgnored())  # for the host
+    attached: TraceIgnoredNames = static(default=TraceIgnoredNames())  # of ``held.HeldObject``
 
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`is_free`; for engines to answer."""
@@ -53,6 +56,13 @@ class World(PytreeSubclasses, StraightLineEdges):
 
     def obstacle_clearance(self, q: jax.Array) -> jax.Array:
         """See :func:`obstacle_clearance`; for engines to answer."""
+        raise NotImplementedError(_NO_ENGINE)
+
+    def with_held_spheres(self, held: HeldSpheres) -> Self:
+        """The same world, whose robot carries these spheres beside its own; for engines.
+
+        They take the place of those that it carried before. See :func:`vrrt_jax.attach`.
+        """
         raise NotImplementedError(_NO_ENGINE)
 
     def with_margin(self, margin: float) -> Self:
@@ -120,6 +130,7 @@ def build_world(
         "obstacle_names": TraceIgnoredNames([""] * num_slots),
         "kinds": TraceIgnoredNames([""] * num_slots),
         "colors": TraceIgnoredNames([()] * num_slots),
+        "robot": TraceIgnored(robot),
     }
     world = closed_form_world(robot, fields)
     return with_obstacles(world, obstacles)
@@ -142,6 +153,10 @@ def with_obstacles(world: World, obstacles: Sequence[Obstacle]) -> World:
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise ValueError(f"obstacle names must differ, but {twice} stand more than once; rename")
+    if held := sorted({*names} & {*held_names(world)}):
+        raise ValueError(
+            f"the robot holds {held} already: detach them first, or give the obstacles other names"
+        )
     spare = num_slots - len(obstacles)
     return dataclasses.replace(
         world,
@@ -163,6 +178,17 @@ def obstacle_list(world: World) -> list[Obstacle]:
         from_slots(world.obstacles, world.kinds), world.obstacle_names, world.colors, strict=True
     )
     return [Obstacle(name=name, rgba=rgba, **fields) for fields, name, rgba in slots if fields]
+
+
+def held_names(world: World) -> list[str]:
+    """What the robot holds, by name."""
+    return [held.obstacle.name for held in world.attached]
+
+
+def no_such_obstacle(world: World, name: str) -> str:
+    """Words for an obstacle that does not stand in a world."""
+    text = f"no obstacle named '{name}'; the world has {[o.name for o in obstacle_list(world)]}"
+    return f"{text}, and the robot holds {held_names(world)}" if world.attached else text
 
 
 def move_obstacle(
@@ -187,7 +213,7 @@ def move_obstacle(
     """
     obstacles = obstacle_list(world)
     if name not in [o.name for o in obstacles]:
-        raise ValueError(f"no obstacle named '{name}'; the world has {[o.name for o in obstacles]}")
+        raise ValueError(no_such_obstacle(world, name))
     changes = {"position": position, "quaternion": quaternion, "size": size}
     changes = {k: floats(v) for k, v in changes.items() if v is not None}
     if "size" in changes:

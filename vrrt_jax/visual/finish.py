@@ -21,7 +21,7 @@ from vrrt_jax.outcome import Chosen, finish, time_left
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.verify import verify_path
-from vrrt_jax.scene.world import World, obstacle_list, with_margin
+from vrrt_jax.scene.world import World, with_margin
 from vrrt_jax.visual.distinct import distances_to, distinct
 from vrrt_jax.visual.policy import VisualRRT
 from vrrt_jax.visual.polish import Polished, evaluate_cost, linearize, polish
@@ -212,11 +212,10 @@ def _straight(
     The exact check judges, which also grants what the covering spheres refuse. A world with an
     ``is_free`` of its own is asked as well.
     """
-    obstacles = obstacle_list(world)
-    exact_scene(robot, obstacles)  # built once, and no part of any search
+    exact_scene(robot, world)  # built once, and no part of any search
     started = time.perf_counter()
     path = np.stack([q_start, q_goal])
-    seen = verify_path(robot, obstacles, path, step=SWEEP_STEP, measure_clearance=True)
+    seen = verify_path(robot, world, path, step=SWEEP_STEP, measure_clearance=True)
     clear = seen.ok and not seen.clearance < world.margin + SWEEP_MARGIN
     if clear and overrides_is_free(world):
         edge = world.edge(jnp.asarray(path[:1]), jnp.asarray(path[1:]))

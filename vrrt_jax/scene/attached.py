@@ -1,0 +1,235 @@
+"""Attach an object to the hand, so that it moves with it and is checked as a part of the robot."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from vrrt_jax.core.types import TraceIgnoredNames
+from vrrt_jax.robots.kinematics import chain_from_model
+from vrrt_jax.scene.exact import exact_scene
+from vrrt_jax.scene.held import HeldObject, HeldSpheres, together
+from vrrt_jax.scene.held_cover import cover
+from vrrt_jax.scene.obstacles import Obstacle, check_obstacle, floats, signed_distances, to_slots
+from vrrt_jax.scene.world import (
+    World,
+    batch_is_free,
+    held_names,
+    no_such_obstacle,
+    obstacle_list,
+    with_obstacles,
+)
+
+DEEPEST = 5e-3  # [m] what an object may penetrate where it is gripped, and still stand on it
+TOLERANCE = 1e-3  # [m] how much deeper it may be elsewhere
+_ROUNDING = 5e-4  # [m] of the distances of spheres where the object is gripped
+
+
+def attach(
+    world: World,
+    obstacle: str | Obstacle,
+    link: str,
+    *,
+    q: Sequence[float] | np.ndarray | None = None,
+) -> World:
+    """Let the robot hold an object: it moves with a link from now on.
+
+    The object is checked against all obstacles, against all other links of the robot, and against
+    what these hold. It may touch whatever the same joint carries: the hand and its fingers.
+
+    The planner sees spheres around the object, 24 at most. They stick out of it by 1 cm, of objects
+    that are larger than a hand by more; ``world.attached[-1].bulge`` says by how much. The exact
+    check sees the object itself.
+
+    An object often stands on something where it is gripped. So what it touches at ``q``, by 5 mm at
+    most, is its *support*. From then on the exact check lets the object be as deep in its support as
+    it was, and 1 mm more. The planner lets each sphere be as near to obstacles as it was at ``q``,
+    even within a margin. An object that is deeper than 5 mm in an obstacle is in collision.
+
+    The number of spheres is a part of the compiled program, in multiples of eight: attaching may
+    compile once.
+
+    Args:
+        world: from :func:`vrrt_jax.build_world`.
+        obstacle: the name of an obstacle, which leaves the world, or an object of its own. It is a
+            sphere, a box, a capsule or a cylinder.
+        link: a moving body of the robot, such as "hand".
+        q: (D,) the configuration at which the object is gripped where it stands [rad] or [m]. With
+            None, the pose of an :class:`Obstacle` is in the frame of ``link``, and it has no
+            support.
+
+    Raises:
+        ValueError: there is no such obstacle or link, the link does not move, the name is taken,
+            the object is a plane, or ``q`` is missing or malformed.
+    """
+    obstacles = obstacle_list(world)
+    if isinstance(obstacle, str):
+        found = [other for other in obstacles if other.name == obstacle]
+        if not found:
+            raise ValueError(no_such_obstacle(world, obstacle))
+        if q is None:
+            raise ValueError(f"'{obstacle}' stands in the world; give q, where it is gripped")
+        (obstacle,) = found
+        obstacles = [other for other in obstacles if other is not obstacle]
+    elif obstacle.name in [other.name for other in obstacles] + held_names(world):
+        raise ValueError(
+            f"'{obstacle.name}' is the name of an obstacle already; expected another name, or the "
+            "name itself to attach that obstacle"
+        )
+    check_obstacle(obstacle)
+    held = _held(world, obstacle, link, q)
+    if q is not None:
+        held = _gripped(world, obstacles, held, obstacle, _checked(world, q))
+    world = with_obstacles(world, obstacles)
+    return _holding(world, [*world.attached, held])
+
+
+def detach(world: World, name: str, *, q: Sequence[float] | np.ndarray | None = None) -> World:
+    """Let go of an object that :func:`attach` gave to the robot.
+
+    Args:
+        world: robot and obstacles.
+        name: of the object.
+        q: (D,) where the robot lets go [rad] or [m]: the object is an obstacle from then on. With
+            None it is gone.
+
+    Raises:
+        ValueError: the robot holds nothing of that name, there is no free slot for the obstacle, or
+            ``q`` is malformed.
+    """
+    if name not in held_names(world):
+        raise ValueError(f"the robot holds no '{name}'; it holds {held_names(world)}")
+    (held,) = (held for held in world.attached if held.obstacle.name == name)
+    bare = _holding(world, [other for other in world.attached if other is not held])
+    if q is None:
+        return bare
+    pose = _body_pose(world, held.body, _checked(world, q)) @ pose_of(held.obstacle)
+    return with_obstacles(bare, [*obstacle_list(bare), _placed(held.obstacle, pose)])
+
+
+def touching_spheres(world: World, q: np.ndarray) -> list[str]:
+    """Words for held objects of which only the covering spheres touch something at ``q`` (D,)."""
+    return [
+        f"the spheres around {held.obstacle.name}, which stick out of it by "
+        f"{1e3 * held.bulge:.0f} mm, touch something"
+        for held in world.attached
+        if bool(batch_is_free(detach(world, held.obstacle.name), jnp.asarray(q)[None])[0])
+    ]
+
+
+def _holding(world: World, attached: Sequence[HeldObject]) -> World:
+    held = world.with_held_spheres(together(attached))
+    return dataclasses.replace(held, attached=TraceIgnoredNames(attached))
+
+
+def _held(world: World, obstacle: Obstacle, body: str, q: Any) -> HeldObject:
+    """An object held by a body, without any support."""
+    bodies = _bodies(world.robot.value)
+    moving = [name for name, (link, _) in bodies.items() if link]
+    if body not in moving:
+        what = "does not move" if body in bodies else "is no link of the robot"
+        raise ValueError(f"'{body}' {what}; have: {', '.join(moving)}")
+    link, in_link = bodies[body]
+    if q is not None:
+        pose = np.linalg.inv(_body_pose(world, body, _checked(world, q))) @ pose_of(obstacle)
+        obstacle = _placed(obstacle, pose)
+    around = cover(obstacle.kind, (*floats(obstacle.size), 0.0, 0.0)[:3])
+    in_link = in_link @ pose_of(obstacle)
+    count = len(around.radius)
+    spheres = HeldSpheres(
+        link=np.full(count, link),
+        center=around.center @ in_link[:3, :3].T + in_link[:3, 3],
+        radius=around.radius,
+        gripped_distance=np.full(count, np.inf),
+    )
+    return HeldObject(obstacle=obstacle, body=body, spheres=spheres, bulge=around.bulge)
+
+
+def _gripped(
+    world: World,
+    obstacles: Sequence[Obstacle],
+    held: HeldObject,
+    standing: Obstacle,
+    q: np.ndarray,
+) -> HeldObject:
+    """The same object with its supports: what it touches at ``q`` (D,).
+
+    Args:
+        world: robot and obstacles.
+        obstacles: without the object.
+        held: the object.
+        standing: the same with its pose in the world.
+        q: (D,) where it is gripped.
+    """
+    scene = exact_scene(world.robot.value, obstacles, geometry="spheres", attached=[held])
+    depths = scene.depths(held.obstacle.name, q)
+    # Spheres stick out: beside obstacles that the object is not deep in, they may be where they are.
+    beside = [other for other in obstacles if depths.get(other.name, 0.0) <= DEEPEST]
+    if not beside:
+        return held
+    around, pose = cover(standing.kind, standing.size), pose_of(standing)
+    centers = around.center @ pose[:3, :3].T + pose[:3, 3]
+    slots = to_slots(beside, len(world.obstacles.rounding))
+    distances = np.asarray(signed_distances(slots, jnp.asarray(centers.T, jnp.float32)))
+    spheres = dataclasses.replace(held.spheres, gripped_distance=distances.min(axis=1) - _ROUNDING)
+    supports = tuple(
+        (name, depth + TOLERANCE) for name, depth in depths.items() if -TOLERANCE < depth <= DEEPEST
+    )
+    return dataclasses.replace(held, spheres=spheres, supports=supports)
+
+
+def _checked(world: World, q: Any) -> np.ndarray:
+    """The configuration as numbers (D,)."""
+    q = np.asarray(q, np.float64)
+    if q.shape != (len(world.joint_names),) or not np.isfinite(q).all():
+        raise ValueError(
+            f"q is {q}; expected {len(world.joint_names)} finite numbers, for the joints "
+            f"{', '.join(world.joint_names)}"
+        )
+    return q
+
+
+@functools.lru_cache(maxsize=8)
+def _model(robot: Any) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(robot.xml)
+
+
+@functools.lru_cache(maxsize=8)
+def _bodies(robot: Any) -> dict[str, tuple[int, np.ndarray]]:
+    """The link of each body, and the body's pose (4, 4) in it, by name."""
+    model = _model(robot)
+    _, link, pose = chain_from_model(model)
+    return {model.body(k).name: (int(link[k]), pose[k]) for k in range(1, model.nbody)}
+
+
+def _body_pose(world: World, body: str, q: np.ndarray) -> np.ndarray:
+    """Pose (4, 4) of a body in the world at ``q`` (D,)."""
+    model = _model(world.robot.value)
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_kinematics(model, data)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = data.body(body).xmat.reshape(3, 3), data.body(body).xpos
+    return pose
+
+
+def pose_of(obstacle: Obstacle) -> np.ndarray:
+    """Position and quaternion as a pose (4, 4)."""
+    pose, rotation = np.eye(4), np.zeros(9)
+    quaternion = np.asarray(obstacle.quaternion, np.float64)
+    mujoco.mju_quat2Mat(rotation, quaternion / np.linalg.norm(quaternion))
+    pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), obstacle.position
+    return pose
+
+
+def _placed(obstacle: Obstacle, pose: np.ndarray) -> Obstacle:
+    """The same with another pose (4, 4)."""
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, pose[:3, :3].ravel())
+    return dataclasses.replace(
+        obstacle, position=floats(pose[:3, 3]), quaternion=floats(quaternion)
+    )

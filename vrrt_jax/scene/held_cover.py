@@ -1,0 +1,131 @@
+"""Spheres around a held object: few of them, and how far they stick out is known."""
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+
+import mujoco
+import numpy as np
+
+from vrrt_jax.robots.sphere_cover import cover_geom
+
+MOST_SPHERES = 24  # around one object
+BULGE = 0.01  # [m] what they may stick out, where so many spheres are enough
+_MOST_SECTORS = 8  # of the ends of a cylinder
+_NUM_RADII = 40  # tried for the centers of such sectors
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Cover:
+    """Spheres that contain a primitive."""
+
+    center: np.ndarray  # (h, 3) in the frame of the primitive [m]
+    radius: np.ndarray  # (h,) [m]
+    bulge: float  # how far they stick out at most [m]
+
+
+@functools.lru_cache(maxsize=64)
+def cover(kind: str, size: tuple[float, float, float]) -> Cover:
+    """Spheres around a primitive: a row for a capsule, bricks of a box, slices of a cylinder.
+
+    The fewest are taken that stick out by :data:`BULGE`. Where :data:`MOST_SPHERES` are not enough
+    for that, those are taken that stick out least.
+
+    Args:
+        kind: sphere, capsule, box or cylinder.
+        size: as MuJoCo's geom size [m].
+
+    Raises:
+        ValueError: another kind.
+    """
+    if kind not in _CHOICES:
+        raise ValueError(f"a {kind} cannot be held; expected one of: {', '.join(_CHOICES)}")
+    choices = [c for c in _CHOICES[kind](np.asarray(size)) if len(c.radius) <= MOST_SPHERES]
+    fine = [choice for choice in choices if choice.bulge <= BULGE + 1e-9]
+    if fine:
+        return min(fine, key=lambda choice: (len(choice.radius), choice.bulge))
+    return min(choices, key=lambda choice: choice.bulge)
+
+
+def _sphere(size: np.ndarray) -> Iterator[Cover]:
+    yield Cover(center=np.zeros((1, 3)), radius=size[:1], bulge=0.0)
+
+
+def _rows(size: np.ndarray) -> Iterator[Cover]:
+    """A capsule's axis in more and more gaps between centers."""
+    for num_gaps in range(1, MOST_SPHERES):
+        center, radius = cover_geom(mujoco.mjtGeom.mjGEOM_CAPSULE, size, size[1] / num_gaps)
+        yield Cover(center=center, radius=radius, bulge=float(radius[0] - size[0]))
+
+
+def _bricks(size: np.ndarray) -> Iterator[Cover]:
+    """A box in bricks, with a sphere around each."""
+    for counts in _counts(MOST_SPHERES):
+        brick = size / counts
+        ticks = [h * (2 * np.arange(n) + 1 - n) for h, n in zip(brick, counts, strict=True)]
+        center = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+        radius = np.linalg.norm(brick)
+        yield Cover(
+            center=center,
+            radius=np.full(len(center), radius),
+            bulge=float(radius - brick.min()),
+        )
+
+
+def _counts(most: int) -> Iterator[tuple[int, int, int]]:
+    """All triples of positive numbers whose product is at most ``most``."""
+    for first in range(1, most + 1):
+        for second in range(1, most // first + 1):
+            for third in range(1, most // (first * second) + 1):
+                yield first, second, third
+
+
+def _slices(size: np.ndarray) -> Iterator[Cover]:
+    """A cylinder in slices of equal height, whose first and last are cut into sectors."""
+    radius, half = size[:2]
+    for num_slices, num_sectors in itertools.product(
+        range(1, MOST_SPHERES + 1), (1, *range(3, _MOST_SECTORS + 1))
+    ):
+        num_ends = min(num_slices, 2)
+        if num_slices - num_ends + num_ends * num_sectors > MOST_SPHERES:
+            continue
+        thickness = half / num_slices  # half of it
+        heights = thickness * (2 * np.arange(num_slices) + 1 - num_slices)
+        # Whole slices, between the ends.
+        whole = np.hypot(radius, thickness)
+        centers = [np.column_stack([np.zeros((num_slices, 2)), heights])[1:-1]]
+        radii = [np.full(len(centers[0]), whole)]
+        bulge = whole - radius if len(centers[0]) else 0.0
+        # Sectors of the ends.
+        off, reach = _sector(radius, thickness, num_sectors)
+        angle = 2 * np.pi * np.arange(num_sectors) / num_sectors
+        ring = off * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        for height in sorted({heights[0], heights[-1]}):
+            centers.append(np.column_stack([ring, np.full(num_sectors, height)]))
+            radii.append(np.full(num_sectors, reach))
+        yield Cover(
+            center=np.concatenate(centers),
+            radius=np.concatenate(radii),
+            bulge=float(max(bulge, reach - thickness, off + reach - radius)),
+        )
+
+
+def _sector(radius: float, thickness: float, num_sectors: int) -> tuple[float, float]:
+    """Distance from the axis and radius of the sphere around a sector of a slice, the best one."""
+    if num_sectors == 1:
+        return 0.0, float(np.hypot(radius, thickness))
+    off = np.linspace(0.0, radius, _NUM_RADII)
+    # The farthest points of a sector are the ends of its arc, and its tip on the axis.
+    corner = radius**2 + off**2 - 2 * radius * off * np.cos(np.pi / num_sectors)
+    reach = np.sqrt(np.maximum(corner, off**2) + thickness**2)
+    best = np.argmin(np.maximum(reach - thickness, off + reach - radius))
+    return float(off[best]), float(reach[best])
+
+
+_CHOICES: Mapping[str, Callable[[np.ndarray], Iterator[Cover]]] = {
+    "sphere": _sphere,
+    "capsule": _rows,
+    "box": _bricks,
+    "cylinder": _slices,
+}
