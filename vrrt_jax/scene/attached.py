@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from vrrt_jax.core.types import TraceIgnoredNames
 from vrrt_jax.robots.kinematics import chain_from_model
 from vrrt_jax.scene.exact import exact_scene
-from vrrt_jax.scene.held import HeldObject, HeldSpheres, together
+from vrrt_jax.scene.held import HeldObject, HeldSpheres
 from vrrt_jax.scene.held_cover import cover
 from vrrt_jax.scene.obstacles import Obstacle, check_obstacle, floats, signed_distances, to_slots
 from vrrt_jax.scene.world import (
@@ -24,8 +23,8 @@ from vrrt_jax.scene.world import (
     with_obstacles,
 )
 
-DEEPEST = 5e-3  # [m] what an object may penetrate where it is gripped, and still stand on it
-TOLERANCE = 1e-3  # [m] how much deeper it may be elsewhere
+DEEPEST = 0.015  # [m] how deep an object may be in an obstacle that it is gripped on
+TOLERANCE = 1e-3  # [m] how much deeper it may be from then on
 _ROUNDING = 5e-4  # [m] of the distances of spheres where the object is gripped
 
 
@@ -45,10 +44,11 @@ def attach(
     that are larger than a hand by more; ``world.attached[-1].bulge`` says by how much. The exact
     check sees the object itself.
 
-    An object often stands on something where it is gripped. So what it touches at ``q``, by 5 mm at
-    most, is its *support*. From then on the exact check lets the object be as deep in its support as
-    it was, and 1 mm more. The planner lets each sphere be as near to obstacles as it was at ``q``,
-    even within a margin. An object that is deeper than 5 mm in an obstacle is in collision.
+    An object often stands on something where it is gripped, and is modeled to sink in a little. So
+    from then on the object may be as deep in each obstacle as it was at ``q``, and 1 mm more. That
+    goes for the exact check. The planner lets each sphere be as near to each obstacle as it was at
+    ``q``, even within a margin. An obstacle that the object is in by more than 15 mm at ``q`` gets
+    nothing of this: the object is in collision there.
 
     The number of spheres is a part of the compiled program, in multiples of eight: attaching may
     compile once.
@@ -85,7 +85,7 @@ def attach(
     if q is not None:
         held = _gripped(world, obstacles, held, obstacle, _checked(world, q))
     world = with_obstacles(world, obstacles)
-    return _holding(world, [*world.attached, held])
+    return world.holding([*world.attached, held])
 
 
 def detach(world: World, name: str, *, q: Sequence[float] | np.ndarray | None = None) -> World:
@@ -104,7 +104,7 @@ def detach(world: World, name: str, *, q: Sequence[float] | np.ndarray | None = 
     if name not in held_names(world):
         raise ValueError(f"the robot holds no '{name}'; it holds {held_names(world)}")
     (held,) = (held for held in world.attached if held.obstacle.name == name)
-    bare = _holding(world, [other for other in world.attached if other is not held])
+    bare = world.holding([other for other in world.attached if other is not held])
     if q is None:
         return bare
     pose = _body_pose(world, held.body, _checked(world, q)) @ pose_of(held.obstacle)
@@ -119,11 +119,6 @@ def touching_spheres(world: World, q: np.ndarray) -> list[str]:
         for held in world.attached
         if bool(batch_is_free(detach(world, held.obstacle.name), jnp.asarray(q)[None])[0])
     ]
-
-
-def _holding(world: World, attached: Sequence[HeldObject]) -> World:
-    held = world.with_held_spheres(together(attached))
-    return dataclasses.replace(held, attached=TraceIgnoredNames(attached))
 
 
 def _held(world: World, obstacle: Obstacle, body: str, q: Any) -> HeldObject:
@@ -144,9 +139,15 @@ def _held(world: World, obstacle: Obstacle, body: str, q: Any) -> HeldObject:
         link=np.full(count, link),
         center=around.center @ in_link[:3, :3].T + in_link[:3, 3],
         radius=around.radius,
-        gripped_distance=np.full(count, np.inf),
     )
-    return HeldObject(obstacle=obstacle, body=body, spheres=spheres, bulge=around.bulge)
+    return HeldObject(
+        obstacle=obstacle,
+        body=body,
+        spheres=spheres,
+        bulge=around.bulge,
+        gripped_distances={},
+        supports={},
+    )
 
 
 def _gripped(
@@ -156,7 +157,7 @@ def _gripped(
     standing: Obstacle,
     q: np.ndarray,
 ) -> HeldObject:
-    """The same object with its supports: what it touches at ``q`` (D,).
+    """The same object, that knows how near to obstacles it is at ``q`` (D,).
 
     Args:
         world: robot and obstacles.
@@ -167,19 +168,26 @@ def _gripped(
     """
     scene = exact_scene(world.robot.value, obstacles, geometry="spheres", attached=[held])
     depths = scene.depths(held.obstacle.name, q)
-    # Spheres stick out: beside obstacles that the object is not deep in, they may be where they are.
     beside = [other for other in obstacles if depths.get(other.name, 0.0) <= DEEPEST]
     if not beside:
         return held
+    # The spheres stick out, and may be deeper in than the object is.
     around, pose = cover(standing.kind, standing.size), pose_of(standing)
     centers = around.center @ pose[:3, :3].T + pose[:3, 3]
     slots = to_slots(beside, len(world.obstacles.rounding))
     distances = np.asarray(signed_distances(slots, jnp.asarray(centers.T, jnp.float32)))
-    spheres = dataclasses.replace(held.spheres, gripped_distance=distances.min(axis=1) - _ROUNDING)
-    supports = tuple(
-        (name, depth + TOLERANCE) for name, depth in depths.items() if -TOLERANCE < depth <= DEEPEST
+    return dataclasses.replace(
+        held,
+        gripped_distances={
+            other.name: column - _ROUNDING
+            for other, column in zip(beside, distances.T, strict=False)
+        },
+        supports={
+            name: depth + TOLERANCE
+            for name, depth in depths.items()
+            if -TOLERANCE < depth <= DEEPEST
+        },
     )
-    return dataclasses.replace(held, spheres=spheres, supports=supports)
 
 
 def _checked(world: World, q: Any) -> np.ndarray:

@@ -5,7 +5,7 @@ cost many times as much; :mod:`vrrt_jax.scene.mjx` checks one against the other.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import jax
@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.check_protocols import overrides_is_free
-from vrrt_jax.core.types import pytree
+from vrrt_jax.core.types import TraceIgnoredNames, pytree
 from vrrt_jax.robots.kinematics import Spheres, lever_arms, link_poses, place, placement
-from vrrt_jax.scene.held import HeldSpheres, together
+from vrrt_jax.scene.held import HeldObject, HeldSpheres, gripped_distances, together
 from vrrt_jax.scene.obstacles import signed_distances
 from vrrt_jax.scene.world import World
 
@@ -32,7 +32,7 @@ class ClosedFormWorld(World):
     collision_spheres: jax.Array  # (L * 12, 3 n) their placement, see ``kinematics.placement``
     collision_radius: jax.Array  # (n,) [m]
     # Spheres of a held object may always be as near to obstacles as where it was gripped.
-    gripped_distance: jax.Array  # (n,) of their centers there, infinite for all others [m]
+    gripped_distance: jax.Array  # (n, K) of their centers there, infinite for all others [m]
     self_collision_spheres: jax.Array  # (L * 12, 3 m) placement of these
     contact_distance: jax.Array  # (m, m) at which two of them touch, 0 for unchecked pairs [m]
     self_margin: jax.Array  # () clearance asked of each other, part of the contact distance [m]
@@ -74,10 +74,21 @@ class ClosedFormWorld(World):
         """See :func:`vrrt_jax.scene.world.obstacle_clearance`."""
         return jnp.min(self._clearances(link_poses(self.chain, q), 0.0))
 
-    def with_held_spheres(self, held: HeldSpheres) -> Self:
-        """See :meth:`vrrt_jax.scene.world.World.with_held_spheres`."""
-        bare = dataclasses.replace(self, **sphere_fields(self.robot.value, held))
-        return dataclasses.replace(bare.with_margin(float(self.self_margin)), margin=self.margin)
+    def holding(self, attached: Sequence[HeldObject]) -> Self:
+        """See :meth:`vrrt_jax.scene.world.World.holding`."""
+        fields = sphere_fields(self.robot.value, attached, len(self.obstacles.rounding))
+        world = dataclasses.replace(self, attached=TraceIgnoredNames(attached), **fields)
+        world = dataclasses.replace(world.with_margin(self.self_margin), margin=self.margin)
+        return dataclasses.replace(world, **world.fields_of(self.obstacle_names))
+
+    def fields_of(self, names: Sequence[str]) -> dict[str, Any]:
+        """See :meth:`vrrt_jax.scene.world.World.fields_of`."""
+        if not self.attached:
+            return {}
+        held = gripped_distances(self.attached, names)
+        num_own = len(self.collision_radius) - len(held)
+        distance = self.gripped_distance.at[num_own:, : len(names)].set(held)
+        return {"gripped_distance": distance.at[:, len(names) :].set(jnp.inf)}
 
     def with_margin(self, margin: float) -> Self:
         """See :func:`vrrt_jax.scene.world.with_margin`."""
@@ -93,8 +104,8 @@ class ClosedFormWorld(World):
     def _clearances(self, poses: jax.Array, margin: jax.Array | float) -> jax.Array:
         """Distances (n,) of the collision spheres, larger by a margin, to obstacles [m]."""
         distances = signed_distances(self.obstacles, place(self.collision_spheres, poses))
-        needed = jnp.minimum(self.collision_radius + margin, self.gripped_distance)
-        return jnp.min(distances, axis=1) - needed
+        radius = self.collision_radius[:, None] + margin
+        return jnp.min(distances - jnp.minimum(radius, self.gripped_distance), axis=1)
 
     def _self_gap(self, poses: jax.Array) -> jax.Array:
         """Smallest difference () of squared distance and squared contact distance [m^2]."""
@@ -111,16 +122,21 @@ def closed_form_world(robot: Any, fields: Mapping[str, Any]) -> ClosedFormWorld:
         robot: from :func:`vrrt_jax.load_robot`.
         fields: of :class:`vrrt_jax.scene.world.World`.
     """
-    return ClosedFormWorld(**sphere_fields(robot, together([])), **fields)
+    num_slots = len(fields["obstacles"].rounding)
+    return ClosedFormWorld(**sphere_fields(robot, [], num_slots), **fields)
 
 
-def sphere_fields(robot: Any, held: HeldSpheres) -> dict[str, jax.Array]:
+def sphere_fields(
+    robot: Any, attached: Sequence[HeldObject], num_slots: int
+) -> dict[str, jax.Array]:
     """The fields of :class:`ClosedFormWorld` beside those of a world.
 
     Args:
         robot: from :func:`vrrt_jax.load_robot`.
-        held: of all that the robot holds; they come after its own.
+        attached: what it holds; spheres of these come after its own.
+        num_slots: K.
     """
+    held = together(attached)
     # A held object is checked against all other links, and against what these hold.
     first, second = np.asarray(robot.self_collision_pairs, int).reshape(-1, 2).T
     link, center, radius = _joined(robot.self_collision_spheres, held)
@@ -136,11 +152,10 @@ def sphere_fields(robot: Any, held: HeldSpheres) -> dict[str, jax.Array]:
     self_collision_spheres = placement(link, center, robot.chain.num_links)
 
     link, center, radius = _joined(robot.collision_spheres, held)
-    unknown = np.full(len(radius) - len(held.radius), np.inf)
     fields = {
         "collision_spheres": placement(link, center, robot.chain.num_links),
         "collision_radius": radius,
-        "gripped_distance": np.concatenate([unknown, held.gripped_distance]),
+        "gripped_distance": np.full((len(radius), num_slots), np.inf),
         "self_collision_spheres": self_collision_spheres,
         "contact_distance": contact_distance,
         "self_margin": 0.0,

@@ -1,7 +1,7 @@
 """What a robot holds: a primitive that moves with a body, and the spheres that stand for it."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -17,9 +17,6 @@ class HeldSpheres:
     link: np.ndarray  # (h,) int
     center: np.ndarray  # (h, 3) in the link's frame [m]
     radius: np.ndarray  # (h,) [m]
-    # How far the centers were from obstacles where the object was gripped: they may always be so
-    # near, whatever radius and margin are. Infinite where nothing is known [m].
-    gripped_distance: np.ndarray  # (h,)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,24 +27,39 @@ class HeldObject:
     body: str
     spheres: HeldSpheres
     bulge: float  # how far the spheres stick out of the object at most [m]
-    # Obstacles that it stands on, and how deep it may be in them at most [m].
-    supports: tuple[tuple[str, float], ...] = ()
+    # Distances (h,) of the spheres' centers to obstacles, by name, where the object was gripped:
+    # they may always be so near to these obstacles, whatever radius and margin are [m].
+    gripped_distances: Mapping[str, np.ndarray]
+    # How deep the object may be in obstacles that it was gripped on or beside, by name [m].
+    supports: Mapping[str, float]
 
 
 def together(attached: Sequence[HeldObject]) -> HeldSpheres:
     """The spheres of all objects, as many as a multiple of eight: the last one is repeated."""
-    parts = [held.spheres for held in attached]
-    count = sum(len(part.radius) for part in parts)
-    # Which to take: each once, then the last until they are enough.
-    rows = np.minimum(np.arange(_ROUND * -(-count // _ROUND)), max(count - 1, 0))
-    empty = HeldSpheres(
-        link=np.zeros(0, int),
-        center=np.zeros((0, 3)),
-        radius=np.zeros(0),
-        gripped_distance=np.zeros(0),
+    spheres = [held.spheres for held in attached]
+    rows = _rows(attached)
+    return HeldSpheres(
+        link=np.concatenate([np.zeros(0, int), *(own.link for own in spheres)])[rows],
+        center=np.concatenate([np.zeros((0, 3)), *(own.center for own in spheres)])[rows],
+        radius=np.concatenate([np.zeros(0), *(own.radius for own in spheres)])[rows],
     )
-    fields = {
-        field.name: np.concatenate([getattr(part, field.name) for part in [empty, *parts]])[rows]
-        for field in dataclasses.fields(HeldSpheres)
-    }
-    return HeldSpheres(**fields)
+
+
+def gripped_distances(attached: Sequence[HeldObject], names: Sequence[str]) -> np.ndarray:
+    """How near these spheres may always be to obstacles of these names (K,).
+
+    Returns:
+        (h, K) [m], infinite where nothing is allowed.
+    """
+    found = [np.zeros((0, len(names)))]
+    for held in attached:
+        nothing = np.full(len(held.spheres.radius), np.inf)
+        columns = [held.gripped_distances.get(name, nothing) for name in names]
+        found.append(np.reshape(columns, (len(names), len(nothing))).T)
+    return np.concatenate(found)[_rows(attached)]
+
+
+def _rows(attached: Sequence[HeldObject]) -> np.ndarray:
+    """Which spheres to take: each once, then the last until they are enough."""
+    count = sum(len(held.spheres.radius) for held in attached)
+    return np.minimum(np.arange(_ROUND * -(-count // _ROUND)), max(count - 1, 0))

@@ -16,7 +16,7 @@ import numpy as np
 from vrrt_jax.core.edges import StraightLineEdges
 from vrrt_jax.core.types import PytreeSubclasses, TraceIgnored, TraceIgnoredNames, pytree, static
 from vrrt_jax.robots.kinematics import Chain
-from vrrt_jax.scene.held import HeldSpheres
+from vrrt_jax.scene.held import HeldObject
 from vrrt_jax.scene.obstacles import Obstacle, Obstacles, floats, from_slots, to_slots
 
 _NO_ENGINE = (
@@ -58,12 +58,16 @@ class World(PytreeSubclasses, StraightLineEdges):
         """See :func:`obstacle_clearance`; for engines to answer."""
         raise NotImplementedError(_NO_ENGINE)
 
-    def with_held_spheres(self, held: HeldSpheres) -> Self:
-        """The same world, whose robot carries these spheres beside its own; for engines.
+    def holding(self, attached: Sequence[HeldObject]) -> Self:
+        """The same world, whose robot holds these objects and no others; for engines to answer.
 
-        They take the place of those that it carried before. See :func:`vrrt_jax.attach`.
+        See :func:`vrrt_jax.attach`.
         """
         raise NotImplementedError(_NO_ENGINE)
+
+    def fields_of(self, names: Sequence[str]) -> dict[str, Any]:
+        """Fields of the engine that change with the obstacles: those of these names, in slots."""
+        return {}
 
     def with_margin(self, margin: float) -> Self:
         """See :func:`with_margin`."""
@@ -161,6 +165,7 @@ def with_obstacles(world: World, obstacles: Sequence[Obstacle]) -> World:
     return dataclasses.replace(
         world,
         obstacles=to_slots(obstacles, num_slots),
+        **world.fields_of(names),
         obstacle_names=TraceIgnoredNames(names + [""] * spare),
         kinds=TraceIgnoredNames([o.kind for o in obstacles] + [""] * spare),
         colors=TraceIgnoredNames([o.rgba for o in obstacles] + [()] * spare),
