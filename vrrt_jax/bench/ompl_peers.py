@@ -3,6 +3,7 @@
 OMPL's wheel has no robots. Its states are checked here by C MuJoCo, with the robot's spheres.
 """
 
+import copy
 import functools
 import importlib.util
 import time
@@ -119,7 +120,10 @@ def _setup(robot: Robot, trial: Trial, ompl: Any) -> Any:
 def _checker(robot: Robot, trial: Trial) -> Callable[[Any], bool]:
     """Whether the robot's spheres are free at a state, by C MuJoCo."""
     scene = exact_scene(robot, trial.obstacles, geometry="spheres")
-    model, data, num_joints = scene.model, scene.data, robot.num_joints
+    # A model of its own, where only what touches is a contact.
+    model = copy.copy(scene.model)
+    model.geom_margin[:] = 0.0
+    data, num_joints = mujoco.MjData(model), robot.num_joints
 
     def is_free(state: Any) -> bool:
         data.qpos[:] = state[0:num_joints]

@@ -39,10 +39,7 @@ class Space(Protocol):
         """() longest sub-step between two collision checks, in the units of distances."""
         ...
 
-    @property
-    def node_block(self) -> int:
-        """How many nodes are best handed to :meth:`distances` at once (static)."""
-        ...
+    node_block: ClassVar[int]  # how many nodes are best handed to :meth:`distances` at once
 
     def is_free(self, q: jax.Array) -> jax.Array:
         """Whether ``q`` (D,) touches nothing, () bool."""

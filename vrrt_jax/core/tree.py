@@ -11,17 +11,18 @@ from vrrt_jax.core.edges import Space
 from vrrt_jax.core.types import Rejection, Tree
 
 Payload = TypeVar("Payload")
+Array = jax.Array | np.ndarray
 
 
 UNREACHED = 1e3  # [rad] cost of a root that is not known to be reachable from the first
 
 
 def create(
-    q: np.ndarray,
-    score: np.ndarray,
+    q: Array,
+    score: Array,
     payload: Payload,
     capacity: int,
-    cost: np.ndarray | float = 0.0,
+    cost: Array | float = 0.0,
 ) -> Tree[Payload]:
     """A tree, or a forest of R roots; made on the host.
 
@@ -34,24 +35,24 @@ def create(
     """
     roots = q.shape[0]
 
-    def padded(leaf: jax.Array, fill: float) -> np.ndarray:
+    def padded(leaf: Any, fill: float) -> np.ndarray:
         # On the host, where a dozen small operations cost nothing.
         values = np.asarray(leaf)
         column = np.full((capacity, *values.shape[1:]), fill, values.dtype)
         column[:roots] = values
         return column
 
-    tree = Tree(
-        q=padded(q, 0),
-        parent=np.full(capacity, -1, np.int32),
-        cost=padded(np.broadcast_to(np.asarray(cost, q.dtype), roots), 0),
-        score=padded(score, np.inf),
-        size=np.int32(roots),
-        iteration=np.int32(0),
-        rejected=np.zeros(len(Rejection), np.int32),
-        payload=jax.tree.map(lambda leaf: padded(leaf, 0), payload),
-    )
-    return jax.device_put(tree)
+    columns: dict[str, Any] = {
+        "q": padded(q, 0),
+        "parent": np.full(capacity, -1, np.int32),
+        "cost": padded(np.broadcast_to(np.asarray(cost, q.dtype), roots), 0),
+        "score": padded(score, np.inf),
+        "size": np.int32(roots),
+        "iteration": np.int32(0),
+        "rejected": np.zeros(len(Rejection), np.int32),
+        "payload": jax.tree.map(lambda leaf: padded(leaf, 0), payload),
+    }
+    return Tree(**jax.device_put(columns))
 
 
 def root_costs(num: int) -> np.ndarray:

@@ -72,14 +72,14 @@ class RRTConnect:
         """
         if self.lanes < 2:
             raise ValueError(f"RRT-Connect has {self.lanes} lanes; expected 2 or more")
-        ends = ConnectNode(
-            side=np.array([0, 1], np.int32),
-            fresh=np.array([True, True]),
-            meets=np.array([-1, -1], np.int32),
-        )
+        ends: dict[str, Any] = {
+            "side": np.array([0, 1], np.int32),
+            "fresh": np.array([True, True]),
+            "meets": np.array([-1, -1], np.int32),
+        }
         q = np.stack([np.asarray(q_roots)[0], np.asarray(goal.q)]).astype(np.float32)
         far = np.full(2, np.finfo(np.float32).max)
-        return trees.create(q, far, ends, capacity)
+        return trees.create(q, far, ConnectNode(**ends), capacity)
 
     def goal_score(self, goal: ConfigurationGoal) -> float:
         """0, which only a node has where the trees meet."""
