@@ -20,7 +20,7 @@ from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.world import World, build_world
 
-FORMAT = 1
+FORMAT = 2
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -134,8 +134,8 @@ def _run_scene(benchmark: ArmBenchmark, world: World, problems: ArmProblems) -> 
         "seed": benchmark.seed,
     }
     ours = partial(arm_trials.solve, robot, **settings)
-    if trials:  # the first plan compiles, and is planned again with the others
-        ours(trials[0])
+    for group in arm_trials.alike(trials):  # this plan compiles, and is planned again with others
+        ours(group[0])
     rows = _rows(trials, ours, problems.name)
     scene = {
         "fingerprint": problems.fingerprint,
@@ -143,7 +143,7 @@ def _run_scene(benchmark: ArmBenchmark, world: World, problems: ArmProblems) -> 
         "n": len(chosen),
         "refused": [dataclasses.asdict(refusal) for refusal in refused],
         **summarize(rows),
-        "held_left_out": sum(row["held_left_out"] for row in rows),
+        "held_attached": sum(row["held_attached"] for row in rows),
         "recompiled": sum(row["recompiled"] for row in rows),
     }
     if benchmark.batch is not None and trials:

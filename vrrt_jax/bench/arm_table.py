@@ -49,8 +49,8 @@ def _note(scene: str, found: Mapping[str, Any]) -> str:
     kinds = Counter(refusal["kind"] for refusal in found["refused"])
     told = ", ".join(f"{kind} {count}" for kind, count in kinds.items()) or "none"
     said = [f"refused: {told} of {found['n']}"]
-    if found["held_left_out"]:
-        said.append(f"what the hand holds at the goal was left out of {found['held_left_out']}")
+    if found["held_attached"]:
+        said.append(f"the hand holds something in {found['held_attached']} of the others")
     if found["recompiled"]:
         said.append(f"{found['recompiled']} compiled again, and were timed after that")
     return f"{scene}: {'; '.join(said)}"

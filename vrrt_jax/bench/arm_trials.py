@@ -18,6 +18,7 @@ from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.interrupt import uninterrupted
 from vrrt_jax.core.shortcut import path_length
 from vrrt_jax.robots.robot import Robot
+from vrrt_jax.scene.attached import attach, detach, touching_spheres
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.obstacles import Obstacle
 from vrrt_jax.scene.verify import contacts
@@ -33,10 +34,9 @@ class Trial:
 
     index: int  # in its file
     world: World
-    obstacles: tuple[Obstacle, ...]
     q_start: np.ndarray  # (D,)
     q_goal: np.ndarray  # (D,)
-    held_left_out: bool  # an obstacle that the fingers hold at the goal is not in the world
+    held_attached: bool  # what the fingers hold at the goal moves with the hand, all the way
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,6 +46,7 @@ class Refusal:
     index: int
     # "file": said to be invalid there. "limits": an end is outside of them. "exact": C MuJoCo finds
     # an end in collision with the true meshes. "spheres": only with the spheres that cover them.
+    # "held": an end is free but for what the hand holds.
     kind: str
     reason: str
 
@@ -64,19 +65,21 @@ def pose_problem(robot: Robot, world: World, problems: ArmProblems, index: int) 
     obstacles = problems.obstacles[index]
     q_start, q_goal = problems.q_start[index], problems.q_goal[index]
     held = held_at_goal(robot, obstacles, q_goal)
-    if held is not None:  # here it could be attached to the hand instead of being left out
-        obstacles = obstacles[:held] + obstacles[held + 1 :]
-    world = with_obstacles(world, obstacles)
+    world = bare = with_obstacles(world, obstacles)
+    if held is not None:
+        name = obstacles[held].name
+        world = attach(world, name, robot.link_names[-1], q=q_goal)
+        bare = detach(world, name)
     for what, q in (("start", q_start), ("goal", q_goal)):
-        if found := _refused(robot, world, obstacles, q, what):
-            return Refusal(index=index, kind=found[0], reason=found[1])
+        if found := _refused(robot, world, q, what):
+            is_held = held is not None and _refused(robot, bare, q, what) is None
+            return Refusal(index=index, kind="held" if is_held else found[0], reason=found[1])
     return Trial(
         index=index,
         world=world,
-        obstacles=obstacles,
         q_start=q_start,
         q_goal=q_goal,
-        held_left_out=held is not None,
+        held_attached=held is not None,
     )
 
 
@@ -124,19 +127,18 @@ def _longest_edge(obstacle: Obstacle) -> float:
     return 2 * max(obstacle.size)
 
 
-def _refused(
-    robot: Robot, world: World, obstacles: Sequence[Obstacle], q: np.ndarray, what: str
-) -> tuple[str, str] | None:
+def _refused(robot: Robot, world: World, q: np.ndarray, what: str) -> tuple[str, str] | None:
     """Why a configuration is refused: a kind of :class:`Refusal` and words; None if it is not."""
     try:
         q = checks.check_limits(robot, q, what)
     except ValueError as error:
         return "limits", str(error)
-    if touching := contacts(robot, obstacles, q):
-        geometry = exact_scene(robot, obstacles).geometry
+    if touching := contacts(robot, world, q):
+        geometry = exact_scene(robot, world).geometry
         return "exact" if geometry == "meshes" else "spheres", f"{what}: {'; '.join(touching)}"
     if not bool(batch_is_free(world, jnp.asarray(q)[None])[0]):
-        touching = contacts(robot, obstacles, q, geometry="spheres") or ["within the margin"]
+        touching = contacts(robot, world, q, geometry="spheres") or touching_spheres(world, q)
+        touching = touching or ["within the margin"]
         return "spheres", f"{what}: {'; '.join(touching)}"
     return None
 
@@ -155,7 +157,7 @@ def solve(
 
     Returns:
         A row: ``index``, ``status``, ``solved``, ``wall_ms`` of the whole call, ``stages_ms``,
-        ``cost`` [rad], ``raw_cost`` before shortening, ``held_left_out`` and ``recompiled``.
+        ``cost`` [rad], ``raw_cost`` before shortening, ``held_attached`` and ``recompiled``.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed meanwhile.
@@ -190,9 +192,21 @@ def solve(
         },
         "raw_cost": path_length(trial.world, result.raw_path) if result.ok else None,
         "cost": result.cost if result.ok else None,
-        "held_left_out": trial.held_left_out,
+        "held_attached": trial.held_attached,
         "recompiled": recompiled,
     }
+
+
+def alike(trials: Sequence[Trial]) -> list[list[Trial]]:
+    """Trials in groups that share their compiled functions: what is held adds spheres."""
+    groups: dict[Any, list[Trial]] = {}
+    for trial in trials:
+        groups.setdefault(_shapes(trial), []).append(trial)
+    return list(groups.values())
+
+
+def _shapes(trial: Trial) -> tuple[tuple[int, ...], ...]:
+    return tuple(jnp.shape(leaf) for leaf in jax.tree.leaves(trial.world))
 
 
 def batch_rate(
@@ -206,7 +220,8 @@ def batch_rate(
 ) -> float:
     """Verified problems per second of batched plans, compilation excluded.
 
-    Trials are repeated, with other keys, where they do not fill the last batch.
+    Trials are repeated, with other keys, where they do not fill the last batch of their group, see
+    :func:`alike`.
 
     Args:
         robot: from :func:`vrrt_jax.load_robot`.
@@ -216,9 +231,11 @@ def batch_rate(
         config: settings.
         seed: of the benchmark.
     """
-    num_batches = -(-len(trials) // size)
-    filled = [trials[i % len(trials)] for i in range(num_batches * size)]
-    batches = [filled[k * size : (k + 1) * size] for k in range(num_batches)]
+    batches = []
+    for group in alike(trials):
+        num_batches = -(-len(group) // size)
+        filled = [group[i % len(group)] for i in range(num_batches * size)]
+        batches += [filled[k * size : (k + 1) * size] for k in range(num_batches)]
 
     def plan(number: int) -> int:
         batch = batches[number]
@@ -235,9 +252,11 @@ def batch_rate(
             )
         return sum(result.ok for result in results)
 
-    plan(0)  # compiles
+    for number in range(len(batches)):
+        if number == 0 or _shapes(batches[number][0]) != _shapes(batches[number - 1][0]):
+            plan(number)  # compiles
     started = time.perf_counter()
-    solved = sum(plan(number) for number in range(num_batches))
+    solved = sum(plan(number) for number in range(len(batches)))
     return solved / (time.perf_counter() - started)
 
 

@@ -80,7 +80,7 @@ def solve(robot: Robot, trial: Trial, *, name: str, seed: int) -> dict[str, Any]
         cost = setup.getSolutionPath().length()
         states = setup.getSolutionPath().getStates()
         path = np.array([state[0 : robot.num_joints] for state in states])
-        checked = verify_path(robot, trial.obstacles, path)
+        checked = verify_path(robot, trial.world, path)
         verified = checked.ok
         status = "solved" if verified else f"not verified: {checked.contact}"
     return {
@@ -118,18 +118,19 @@ def _setup(robot: Robot, trial: Trial, ompl: Any) -> Any:
 
 
 def _checker(robot: Robot, trial: Trial) -> Callable[[Any], bool]:
-    """Whether the robot's spheres are free at a state, by C MuJoCo."""
-    scene = exact_scene(robot, trial.obstacles, geometry="spheres")
+    """Whether the robot's spheres and what it holds are free at a state, by C MuJoCo."""
+    scene = exact_scene(robot, trial.world, geometry="spheres")
     # A model of its own, where only what touches is a contact.
     model = copy.copy(scene.model)
-    model.geom_margin[:] = 0.0
+    model.geom_margin[:] = model.pair_margin[:] = 0.0
     data, num_joints = mujoco.MjData(model), robot.num_joints
 
     def is_free(state: Any) -> bool:
         data.qpos[:] = state[0:num_joints]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
-        return data.ncon == 0
+        # A held object may touch its support: the scene knows how deep.
+        return data.ncon == 0 or bool(scene.attached and not scene.touching(data.qpos))
 
     return is_free
 
