@@ -11,8 +11,8 @@ import numpy as np
 
 from vrrt_jax.robots.kinematics import chain_from_model
 from vrrt_jax.scene.exact import exact_scene
-from vrrt_jax.scene.held import HeldObject, HeldSpheres
-from vrrt_jax.scene.held_cover import cover
+from vrrt_jax.scene.held import Grip, HeldObject, HeldSpheres
+from vrrt_jax.scene.held_cover import corners, cover
 from vrrt_jax.scene.obstacles import Obstacle, check_obstacle, floats, signed_distances, to_slots
 from vrrt_jax.scene.world import (
     World,
@@ -25,7 +25,7 @@ from vrrt_jax.scene.world import (
 
 DEEPEST = 0.015  # [m] how deep an object may be in an obstacle that it is gripped on
 TOLERANCE = 1e-3  # [m] how much deeper it may be from then on
-_ROUNDING = 5e-4  # [m] of the distances of spheres where the object is gripped
+_ROUNDING = 1e-4  # [m] of the distances of spheres where the object is gripped
 
 
 def attach(
@@ -81,9 +81,7 @@ def attach(
             "name itself to attach that obstacle"
         )
     check_obstacle(obstacle)
-    held = _held(world, obstacle, link, q)
-    if q is not None:
-        held = _gripped(world, obstacles, held, obstacle, _checked(world, q))
+    held = _held(world, obstacles, obstacle, link, q)
     world = with_obstacles(world, obstacles)
     return world.holding([*world.attached, held])
 
@@ -121,8 +119,10 @@ def touching_spheres(world: World, q: np.ndarray) -> list[str]:
     ]
 
 
-def _held(world: World, obstacle: Obstacle, body: str, q: Any) -> HeldObject:
-    """An object held by a body, without any support."""
+def _held(
+    world: World, obstacles: Sequence[Obstacle], obstacle: Obstacle, body: str, q: Any
+) -> HeldObject:
+    """An object held by a body among other obstacles."""
     bodies = _bodies(world.robot.value)
     moving = [name for name, (link, _) in bodies.items() if link]
     if body not in moving:
@@ -133,54 +133,55 @@ def _held(world: World, obstacle: Obstacle, body: str, q: Any) -> HeldObject:
         pose = np.linalg.inv(_body_pose(world, body, _checked(world, q))) @ pose_of(obstacle)
         obstacle = _placed(obstacle, pose)
     around = cover(obstacle.kind, (*floats(obstacle.size), 0.0, 0.0)[:3])
-    in_link = in_link @ pose_of(obstacle)
-    count = len(around.radius)
-    spheres = HeldSpheres(
-        link=np.full(count, link),
-        center=around.center @ in_link[:3, :3].T + in_link[:3, 3],
-        radius=around.radius,
-    )
-    return HeldObject(
-        obstacle=obstacle,
-        body=body,
-        spheres=spheres,
-        bulge=around.bulge,
-        gripped_distances={},
-        supports={},
-    )
+    spheres = _on_link(link, in_link @ pose_of(obstacle), around.center, around.radius)
+    held = HeldObject(obstacle=obstacle, body=body, spheres=spheres, bulge=around.bulge)
+    if q is None:
+        return held
+    to_world = _body_pose(world, body, _checked(world, q)) @ np.linalg.inv(in_link)
+    grip = _grip(world, obstacles, held, to_world, np.asarray(q, np.float64))
+    return dataclasses.replace(held, grip=grip)
 
 
-def _gripped(
+def _grip(
     world: World,
     obstacles: Sequence[Obstacle],
     held: HeldObject,
-    standing: Obstacle,
+    to_world: np.ndarray,
     q: np.ndarray,
-) -> HeldObject:
-    """The same object, that knows how near to obstacles it is at ``q`` (D,).
+) -> Grip | None:
+    """What is near a held object at ``q`` (D,), None if nothing is.
 
     Args:
-        world: robot and obstacles.
+        world: of the robot.
         obstacles: without the object.
         held: the object.
-        standing: the same with its pose in the world.
+        to_world: (4, 4) pose of its link at ``q``.
         q: (D,) where it is gripped.
     """
     scene = exact_scene(world.robot.value, obstacles, geometry="spheres", attached=[held])
     depths = scene.depths(held.obstacle.name, q)
     beside = [other for other in obstacles if depths.get(other.name, 0.0) <= DEEPEST]
     if not beside:
-        return held
-    # The spheres stick out, and may be deeper in than the object is.
-    around, pose = cover(standing.kind, standing.size), pose_of(standing)
-    centers = around.center @ pose[:3, :3].T + pose[:3, 3]
-    slots = to_slots(beside, len(world.obstacles.rounding))
-    distances = np.asarray(signed_distances(slots, jnp.asarray(centers.T, jnp.float32)))
-    return dataclasses.replace(
-        held,
-        gripped_distances={
+        return None
+    # How near the spheres are to these obstacles. Those that stick out into one may do so again.
+    own = held.spheres
+    distances = _distances(beside, to_world, own.center)
+    is_cut = (distances < own.radius[:, None]).any(axis=1)
+    # They contain the object no more on that side: its corners there are checked beside them.
+    in_object, radius = corners(held.obstacle.kind, held.obstacle.size)
+    link, in_link = _bodies(world.robot.value)[held.body]
+    found = _on_link(link, in_link @ pose_of(held.obstacle), in_object, radius)
+    apart = np.linalg.norm(found.center[:, None] - own.center[is_cut], axis=-1)
+    is_bare = (apart <= own.radius[is_cut] + TOLERANCE).any(axis=1)
+    found = HeldSpheres(
+        link=found.link[is_bare], center=found.center[is_bare], radius=found.radius[is_bare]
+    )
+    distances = np.concatenate([distances, _distances(beside, to_world, found.center)])
+    return Grip(
+        corners=found,
+        distances={
             other.name: column - _ROUNDING
-            for other, column in zip(beside, distances.T, strict=False)
+            for other, column in zip(beside, distances.T, strict=True)
         },
         supports={
             name: depth + TOLERANCE
@@ -188,6 +189,29 @@ def _gripped(
             if -TOLERANCE < depth <= DEEPEST
         },
     )
+
+
+def _on_link(
+    link: int, in_link: np.ndarray, centers: np.ndarray, radius: np.ndarray | float
+) -> HeldSpheres:
+    """Spheres on a link, of centers (n, 3) in a frame whose pose (4, 4) in the link is given."""
+    return HeldSpheres(
+        link=np.full(len(centers), link),
+        center=_moved(in_link, centers),
+        radius=np.broadcast_to(radius, len(centers)),
+    )
+
+
+def _moved(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _distances(
+    obstacles: Sequence[Obstacle], to_world: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """Distances (n, K) of points (n, 3) in a frame that has a pose (4, 4) to obstacles [m]."""
+    points = jnp.asarray(_moved(to_world, points).T, jnp.float32)
+    return np.asarray(signed_distances(to_slots(obstacles, len(obstacles)), points), np.float64)
 
 
 def _checked(world: World, q: Any) -> np.ndarray:

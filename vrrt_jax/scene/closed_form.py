@@ -136,9 +136,9 @@ def sphere_fields(
         attached: what it holds; spheres of these come after its own.
         num_slots: K.
     """
-    held = together(attached)
     # A held object is checked against all other links, and against what these hold.
     first, second = np.asarray(robot.self_collision_pairs, int).reshape(-1, 2).T
+    held = together(attached, with_corners=False)
     link, center, radius = _joined(robot.self_collision_spheres, held)
     contact_distance = np.zeros((len(radius), len(radius)), np.float32)
     contact_distance[first, second] = radius[first] + radius[second]
@@ -151,6 +151,7 @@ def sphere_fields(
     relative[(own[:, :, None] > 0) & (own[:, None] > 0)] = 0.0
     self_collision_spheres = placement(link, center, robot.chain.num_links)
 
+    held = together(attached, with_corners=True)
     link, center, radius = _joined(robot.collision_spheres, held)
     fields = {
         "collision_spheres": placement(link, center, robot.chain.num_links),

@@ -96,7 +96,7 @@ def allowed_depths(
     """
     allowed = np.zeros((num_bodies, num_bodies) if attached else (0, 0))
     for held, body in zip(attached, held_bodies, strict=True):
-        for name, depth in held.supports.items():
+        for name, depth in (held.grip.supports if held.grip else {}).items():
             if name in obstacle_bodies:
                 other = obstacle_bodies[name]
                 allowed[body, other] = allowed[other, body] = depth

@@ -25,41 +25,54 @@ class HeldObject:
 
     obstacle: Obstacle  # its pose is in the frame of the body
     body: str
-    spheres: HeldSpheres
-    bulge: float  # how far the spheres stick out of the object at most [m]
-    # Distances (h,) of the spheres' centers to obstacles, by name, where the object was gripped:
-    # they may always be so near to these obstacles, whatever radius and margin are [m].
-    gripped_distances: Mapping[str, np.ndarray]
+    spheres: HeldSpheres  # contain the object
+    bulge: float  # how far they stick out of it at most [m]
+    grip: "Grip | None" = None  # where it was gripped, if that is known
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Grip:
+    """What stood near an object where it was gripped. Letters: ``c`` corners."""
+
+    corners: HeldSpheres  # of the object, where its spheres stick out into something
+    # Distances (h + c,) of the centers of spheres and corners to obstacles, by name: they may
+    # always be so near to these obstacles, whatever radius and margin are [m].
+    distances: Mapping[str, np.ndarray]
     # How deep the object may be in obstacles that it was gripped on or beside, by name [m].
     supports: Mapping[str, float]
 
 
-def together(attached: Sequence[HeldObject]) -> HeldSpheres:
+def together(attached: Sequence[HeldObject], *, with_corners: bool) -> HeldSpheres:
     """The spheres of all objects, as many as a multiple of eight: the last one is repeated."""
-    spheres = [held.spheres for held in attached]
-    rows = _rows(attached)
+    parts = [part for held in attached for part in _parts(held, with_corners)]
+    rows = _rows(sum(len(part.radius) for part in parts))
     return HeldSpheres(
-        link=np.concatenate([np.zeros(0, int), *(own.link for own in spheres)])[rows],
-        center=np.concatenate([np.zeros((0, 3)), *(own.center for own in spheres)])[rows],
-        radius=np.concatenate([np.zeros(0), *(own.radius for own in spheres)])[rows],
+        link=np.concatenate([np.zeros(0, int), *(part.link for part in parts)])[rows],
+        center=np.concatenate([np.zeros((0, 3)), *(part.center for part in parts)])[rows],
+        radius=np.concatenate([np.zeros(0), *(part.radius for part in parts)])[rows],
     )
 
 
 def gripped_distances(attached: Sequence[HeldObject], names: Sequence[str]) -> np.ndarray:
-    """How near these spheres may always be to obstacles of these names (K,).
+    """How near these spheres, corners among them, may always be to obstacles of these names (K,).
 
     Returns:
         (h, K) [m], infinite where nothing is allowed.
     """
     found = [np.zeros((0, len(names)))]
     for held in attached:
-        nothing = np.full(len(held.spheres.radius), np.inf)
-        columns = [held.gripped_distances.get(name, nothing) for name in names]
+        nothing = np.full(sum(len(part.radius) for part in _parts(held, True)), np.inf)
+        known = held.grip.distances if held.grip else {}
+        columns = [known.get(name, nothing) for name in names]
         found.append(np.reshape(columns, (len(names), len(nothing))).T)
-    return np.concatenate(found)[_rows(attached)]
+    distances = np.concatenate(found)
+    return distances[_rows(len(distances))]
 
 
-def _rows(attached: Sequence[HeldObject]) -> np.ndarray:
+def _parts(held: HeldObject, with_corners: bool) -> list[HeldSpheres]:
+    return [held.spheres, *([held.grip.corners] if held.grip and with_corners else [])]
+
+
+def _rows(count: int) -> np.ndarray:
     """Which spheres to take: each once, then the last until they are enough."""
-    count = sum(len(held.spheres.radius) for held in attached)
     return np.minimum(np.arange(_ROUND * -(-count // _ROUND)), max(count - 1, 0))

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -13,6 +13,7 @@ from vrrt_jax.robots.sphere_cover import cover_geom
 MOST_SPHERES = 24  # around one object
 BULGE = 0.01  # [m] what they may stick out, where so many spheres are enough
 _MOST_SECTORS = 8  # of the ends of a cylinder
+_RIM = 12  # corners of the prism around a cylinder, 3.5 % wider
 _NUM_RADII = 40  # tried for the centers of such sectors
 
 
@@ -46,6 +47,25 @@ def cover(kind: str, size: tuple[float, float, float]) -> Cover:
     if fine:
         return min(fine, key=lambda choice: (len(choice.radius), choice.bulge))
     return min(choices, key=lambda choice: choice.bulge)
+
+
+def corners(kind: str, size: Sequence[float]) -> tuple[np.ndarray, float]:
+    """Spheres of one radius whose convex hull is a primitive, or a little larger.
+
+    Returns:
+        Their centers (c, 3) in the frame of the primitive, and their radius [m].
+    """
+    if kind == "sphere":
+        return np.zeros((1, 3)), size[0]
+    if kind == "capsule":
+        return np.array([[0.0, 0.0, -size[1]], [0.0, 0.0, size[1]]]), size[0]
+    if kind == "box":
+        return np.array(list(itertools.product((-1, 1), repeat=3))) * size, 0.0
+    angle = 2 * np.pi * np.arange(_RIM) / _RIM
+    rim = size[0] / np.cos(np.pi / _RIM) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.concatenate(
+        [np.column_stack([rim, np.full(_RIM, z)]) for z in (-size[1], size[1])]
+    ), 0.0
 
 
 def _sphere(size: np.ndarray) -> Iterator[Cover]:
