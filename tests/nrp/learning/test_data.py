@@ -19,7 +19,7 @@ from nrp_jax.learning import data, shards
 from nrp_jax.learning.difficulty import fair_house
 from nrp_jax.scene.robots import load_robot
 
-SETTINGS = shards.DatasetSettings(task="snake", queries=6, waypoints=4, nodes=500, seed=3)
+SETTINGS = shards.DatasetSettings(task="snake", queries=6, waypoints=4, nodes=500, seed=4)
 HOMES = {"homes": 2, "test_homes": 1}
 
 
