@@ -157,7 +157,8 @@ def test_a_guess_becomes_a_root(panda, self_model, camera, image, open_world):
     args = (panda, open_world, self_model, camera, image, Q_START)
     told = vrrt_jax.plan(*args, key=jax.random.key(0), config=config, q_guess=Q_GOAL + 0.05)
     np.testing.assert_allclose(told.tree.q[1], Q_GOAL + 0.05, atol=1e-6)
-    assert told.loss < vrrt_jax.plan(*args, key=jax.random.key(0), config=config).loss
+    other = vrrt_jax.plan(*args, key=jax.random.key(0), config=config, q_guess=Q_START + 0.05)
+    assert told.loss < other.loss
     with pytest.raises(ValueError, match="the guess is outside the limits: joint 'joint4'"):
         vrrt_jax.plan(*args, key=jax.random.key(0), config=config, q_guess=np.zeros(7) + 1)
 

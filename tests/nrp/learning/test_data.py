@@ -65,6 +65,7 @@ def test_a_second_run_does_nothing(folder, whole):
     assert before == {path: path.stat().st_mtime_ns for path in folder.glob("*.npz")}
 
 
+@pytest.mark.light_compilation
 def test_scores_are_written(folder, tmp_path, capsys):
     maps = tmp_path / "maps"
     maps.mkdir()

@@ -271,6 +271,7 @@ def test_dr_robot_is_a_plain_adam_chain(near_task):
     assert found.loss <= float(goal.loss(world, jnp.asarray(near_task.q_start)))
 
 
+@pytest.mark.light_compilation
 def test_rrt_star_arrives_where_joints_wrap():
     robot, world = tasks.bench_robot("fetch"), tasks.bench_world("fetch", "")
     joint = int(np.flatnonzero(robot.is_continuous)[-1])
