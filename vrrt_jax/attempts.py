@@ -1,10 +1,11 @@
 """Plans to goals that are known by their loss: seeds, a search, its end; and again if it failed."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.config import PlannerConfig
@@ -113,3 +114,54 @@ def termination_of(config: PlannerConfig, policy: ExpansionPolicy, goal: Goal) -
         min_improvement=budget.min_improvement,
         min_ratio=budget.min_ratio,
     )
+
+
+def plan_batch_by_loss(
+    robot: Robot,
+    world: World,
+    problems: Sequence[VisualProblem],
+    policy: ExpansionPolicy,
+    starts: Sequence[np.ndarray],
+    keys: jax.Array,
+    config: PlannerConfig,
+    on_progress: Progress,
+) -> list[PlanResult]:
+    """One attempt at each of Q problems, in one search over all of them; see ``plan_batch``."""
+    with interruptible():
+        trees, compile_s, seed_s = zip(
+            *(
+                seeded_tree(world, problem, policy, q_start[None], own_key, config)
+                for problem, q_start, own_key in zip(problems, starts, keys, strict=True)
+            ),
+            strict=True,
+        )
+        terminations = [termination_of(config, policy, problem.goal) for problem in problems]
+        found = search(
+            world,
+            _stack([problem.goal for problem in problems]),
+            policy,
+            _stack(trees),
+            key=keys,
+            termination=_stack(terminations),
+            time_limit_s=time_left(config, sum(seed_s)).budget.time_limit_s,
+            max_capacity=config.tree.max_capacity,
+            batched=True,
+            on_progress=on_progress,
+        )
+        results = []
+        for i, (q_start, problem) in enumerate(zip(starts, problems, strict=True)):
+            own = dataclasses.replace(
+                found,
+                tree=jax.tree.map(lambda leaf: leaf[i], found.tree),  # noqa: B023 - used at once
+                stopped=found.stopped_each[i],
+                compile_s=found.compile_s + sum(compile_s),
+                search_s=found.search_s + seed_s[i],
+            )
+            results.append(
+                finish_visual(robot, world, problem, policy, own, q_start, keys[i], config)
+            )
+    return results
+
+
+def _stack(items: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *items)

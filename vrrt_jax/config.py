@@ -92,6 +92,15 @@ class Budget:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class PathConfig:
+    """What a path keeps away from."""
+
+    # Clearance to obstacles, and to the robot itself [m]: less where an end of the path is nearer,
+    # or where no path keeps it. The result says how much there is.
+    margin: float = setting(0.01, 0.0, 1.0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class PlannerConfig:
     """Settings of a plan, by stage. The defaults measure best; :meth:`paper` is as published.
 
@@ -103,6 +112,7 @@ class PlannerConfig:
     seeds: SeedConfig = SeedConfig()
     polish: PolishConfig = PolishConfig()
     match: MatchConfig = MatchConfig()
+    path: PathConfig = PathConfig()
     budget: Budget = Budget()
 
     @classmethod

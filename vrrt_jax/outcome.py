@@ -9,9 +9,10 @@ from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.postprocess import plan_result, postprocess, unchecked
 from vrrt_jax.core.result import EARLY_STOPS, STATUS_OF, PlanResult, Status
 from vrrt_jax.core.search import SearchResult
+from vrrt_jax.core.shortcut import padded
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.verify import check_path
-from vrrt_jax.scene.world import World
+from vrrt_jax.scene.world import World, batch_clearance, keeping_clearance
 
 # What to try next, by how a plan to an image ended.
 ADVICE = {
@@ -74,8 +75,9 @@ def finish(
     """
     done = unchecked(q_start[None])
     if chosen.path is not None:
+        room = keeping_clearance(world, padded(chosen.path), config.path.margin)
         done = postprocess(
-            world,
+            room,
             chosen.path,
             lambda path: check_path(robot, world, path, step=config.budget.verify_step),
             key=key,
@@ -92,7 +94,7 @@ def finish(
         status = STATUS_OF.get(found.stopped, Status.NO_MATCH)
     else:
         status = Status.NOT_VERIFIED
-    return plan_result(
+    result = plan_result(
         world,
         found,
         done,
@@ -102,3 +104,5 @@ def finish(
         loss=chosen.loss,
         match_threshold=chosen.threshold,
     )
+    clearance = batch_clearance(world, padded(result.trajectory))
+    return dataclasses.replace(result, clearance=float(clearance))

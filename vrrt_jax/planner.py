@@ -9,24 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax import checks
-from vrrt_jax.attempts import Progress, plan_by_loss, seeded_tree, termination_of
+from vrrt_jax.attempts import Progress, plan_batch_by_loss, plan_by_loss
 from vrrt_jax.config import PlannerConfig, check_config
-from vrrt_jax.core.check_protocols import check_extracted_path, check_goal, check_policy
+from vrrt_jax.core.check_protocols import check_goal, check_policy
 from vrrt_jax.core.goal import ConfigurationGoal
-from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.planners import PLANNERS, RRT, RRTStar
-from vrrt_jax.core.result import STATUS_OF, PlanResult, Status
-from vrrt_jax.core.search import make_termination, search
+from vrrt_jax.core.result import PlanResult
 from vrrt_jax.core.types import ExpansionPolicy, Goal
-from vrrt_jax.outcome import JOINT_ADVICE, Chosen, finish, time_left
+from vrrt_jax.joint import plan_each_to_configuration, plan_to_goal
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.world import World
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera
-from vrrt_jax.visual.finish import finish_visual
 from vrrt_jax.visual.goal import ImageGoal
 from vrrt_jax.visual.policy import VisualRRT
-from vrrt_jax.visual.problem import VisualProblem, make_problem
+from vrrt_jax.visual.problem import make_problem
 
 VISUAL = "visual-rrt"
 
@@ -123,7 +120,7 @@ def plan(
     if isinstance(goal, ConfigurationGoal):
         q_goal = checks.check_start(robot, world, goal.q, what="goal")
         goal = dataclasses.replace(goal, q=jnp.asarray(q_goal))
-        return _plan_to_configuration(robot, world, goal, policy, roots, key, config, on_progress)
+        return plan_to_goal(robot, world, goal, policy, start, key, config, on_progress)
     problem = make_problem(robot, goal, start, config)
     return plan_by_loss(robot, world, problem, policy, roots, key, config, on_progress)
 
@@ -168,8 +165,8 @@ def plan_to_configuration(
 @overload
 def plan_batch(
     robot: Robot,
-    world: World,
-    goals: Sequence[ImageGoal | Goal],
+    world: World | Sequence[World],
+    goals: Sequence[ImageGoal | ConfigurationGoal | Goal],
     q_starts: np.ndarray,
     *,
     key: jax.Array,
@@ -194,7 +191,7 @@ def plan_batch(
 ) -> list[PlanResult]: ...
 def plan_batch(
     robot: Robot,
-    world: World,
+    world: World | Sequence[World],
     goals: Any,
     *inputs: Any,
     q_starts: np.ndarray | None = None,
@@ -203,16 +200,19 @@ def plan_batch(
     config: PlannerConfig | None = None,
     on_progress: Progress = None,
 ) -> list[PlanResult]:
-    """Solve Q problems of one robot and world at once, by an outer ``vmap``.
+    """Solve Q problems of one robot at once.
 
     Call it as ``plan_batch(robot, world, goals, q_starts, key=key)``, or with a self-model, a
-    camera and Q goal images instead of the goals. Problem ``i`` uses the key ``fold_in(key, i)``;
-    each has one attempt. The search times reported hold the search of the whole batch. On a CPU a
-    loop over :func:`plan` is as fast; on other devices the batch pays.
+    camera and Q goal images instead of the goals. Problem ``i`` uses the key ``fold_in(key, i)``.
+
+    Joint goals are planned on as many threads as there are cores, each in its own world if Q worlds
+    are given. Goals that are known by their loss are searched for by an outer ``vmap``, in one
+    world and with one attempt each; their search times hold the search of the whole batch. On a
+    CPU a loop over :func:`plan` is as fast for these; on other devices the batch pays.
 
     Args:
         robot: from :func:`load_robot`.
-        world: for this robot.
+        world: for this robot; or Q of them, for joint goals.
         goals: Q goals that differ in numbers only, such as image goals of one camera.
         inputs: ``q_starts``, unless it is given by name.
         q_starts: (Q, D) start configurations.
@@ -232,102 +232,42 @@ def plan_batch(
     (all_starts,) = _counted(inputs, "q_starts")
     config = PlannerConfig() if config is None else config
     check_config(config)
+    worlds = [world] * len(goals) if isinstance(world, World) else list(world)
+    if len(goals) != len(worlds):
+        raise ValueError(f"got {len(worlds)} worlds and {len(goals)} goals; expected as many")
     if len(goals) != len(all_starts) or len(goals) == 0:
         raise ValueError(
             f"got {len(goals)} goals and {len(all_starts)} starts; expected as many, and one at "
             "least"
         )
+    policy = _policy(planner, goals[0], worlds[0], config)
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(goals)))
     starts: list[np.ndarray] = []
-    problems: list[VisualProblem] = []
-    for i, (goal, q_start) in enumerate(zip(goals, all_starts, strict=True)):
+    checked: list[Any] = []
+    for i, (own, goal, q_start) in enumerate(zip(worlds, goals, all_starts, strict=True)):
         try:
-            if isinstance(goal, ConfigurationGoal):
+            if isinstance(goal, ConfigurationGoal) != isinstance(goals[0], ConfigurationGoal):
                 raise ValueError(
-                    "a batch searches by loss, and the goal is a ConfigurationGoal; expected image "
-                    "goals, or call plan for each joint goal"
+                    f"the goal is a {type(goal).__name__} and that of problem 0 a "
+                    f"{type(goals[0]).__name__}; expected goals of one kind"
                 )
+            starts.append(checks.check_start(robot, own, q_start))
+            if isinstance(goal, ConfigurationGoal):
+                q_goal = checks.check_start(robot, own, goal.q, what="goal")
+                checked.append(dataclasses.replace(goal, q=jnp.asarray(q_goal)))
+                continue
             if not isinstance(goal, ImageGoal):
                 check_goal(goal)
-            starts.append(checks.check_start(robot, world, q_start))
-            problems.append(make_problem(robot, goal, starts[-1], config))
+            checked.append(make_problem(robot, goal, starts[-1], config))
         except ValueError as error:
             raise ValueError(f"problem {i}: {error}") from None
-    policy = _policy(planner, goals[0], world, config)
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(starts)))
-    with interruptible():
-        trees, compile_s, seed_s = zip(
-            *(
-                seeded_tree(world, problem, policy, q_start[None], own_key, config)
-                for problem, q_start, own_key in zip(problems, starts, keys, strict=True)
-            ),
-            strict=True,
+    if isinstance(goals[0], ConfigurationGoal):
+        return plan_each_to_configuration(
+            robot, worlds, checked, policy, starts, keys, config, on_progress
         )
-        terminations = [termination_of(config, policy, problem.goal) for problem in problems]
-        found = search(
-            world,
-            _stack([problem.goal for problem in problems]),
-            policy,
-            _stack(trees),
-            key=keys,
-            termination=_stack(terminations),
-            time_limit_s=time_left(config, sum(seed_s)).budget.time_limit_s,
-            max_capacity=config.tree.max_capacity,
-            batched=True,
-            on_progress=on_progress,
-        )
-        results = []
-        for i, (q_start, problem) in enumerate(zip(starts, problems, strict=True)):
-            own = dataclasses.replace(
-                found,
-                tree=jax.tree.map(lambda leaf: leaf[i], found.tree),  # noqa: B023 - used at once
-                stopped=found.stopped_each[i],
-                compile_s=found.compile_s + sum(compile_s),
-                search_s=found.search_s + seed_s[i],
-            )
-            results.append(
-                finish_visual(robot, world, problem, policy, own, q_start, keys[i], config)
-            )
-    return results
-
-
-def _plan_to_configuration(
-    robot: Robot,
-    world: World,
-    goal: ConfigurationGoal,
-    policy: ExpansionPolicy,
-    roots: np.ndarray,
-    key: jax.Array,
-    config: PlannerConfig,
-    on_progress: Progress,
-) -> PlanResult:
-    """Search, extract the policy's path, shorten and verify it."""
-    found = search(
-        world,
-        goal,
-        policy,
-        policy.init(world, goal, roots, config.tree.capacity),
-        key=key,
-        termination=make_termination(
-            policy.goal_score(goal), max_iterations=config.budget.max_iterations
-        ),
-        time_limit_s=config.budget.time_limit_s,
-        max_capacity=config.tree.max_capacity,
-        on_progress=on_progress,
-    )
-    path = policy.extract_path(found.tree)
-    check_extracted_path(policy, path, roots[0])
-    end = roots[0] if path is None else path[-1]
-    chosen = Chosen(
-        path=path,
-        target=np.asarray(goal.q),
-        loss=float(goal.loss(world, jnp.asarray(end))),
-        threshold=float(goal.threshold),
-    )
-    result = finish(robot, world, found, chosen, roots[0], key, config)
-    status = result.status
-    if path is None:
-        status = STATUS_OF.get(found.stopped, Status.NO_PATH)
-    return dataclasses.replace(result, status=status, advice=JOINT_ADVICE[status])
+    if any(own is not worlds[0] for own in worlds):
+        raise ValueError("goals known by their loss are searched for in one world; got several")
+    return plan_batch_by_loss(robot, worlds[0], checked, policy, starts, keys, config, on_progress)
 
 
 def _policy(
@@ -374,7 +314,3 @@ def _counted(inputs: tuple[Any, ...], *names: str) -> tuple[Any, ...]:
     if len(inputs) != len(names):
         raise ValueError(f"got {len(inputs)} inputs after the goal; expected {', '.join(names)}")
     return inputs
-
-
-def _stack(items: Sequence[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *items)

@@ -30,7 +30,7 @@ def summary(
         "verified": bool(check is not None and check.ok),
         "verified_with": check.geometry if check is not None else None,
         "contact": check.contact if check is not None else None,
-        "clearance_m": _number(check.clearance) if check is not None else None,
+        "clearance_m": _number(result.clearance),
         "loss": result.loss,
         "goal_loss": result.match_threshold,
         "cost": result.cost,

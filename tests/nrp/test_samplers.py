@@ -16,6 +16,8 @@ from nrp_jax.learning.objective import init
 from nrp_jax.scene.robots import load_robot
 from nrp_jax.scene.world import build_world, with_grid
 
+pytestmark = pytest.mark.light_compilation
+
 
 def random_model(kind: str, seed: int = 0) -> Model:
     robot, config = load_robot("snake"), ModelConfig.default("snake", kind)

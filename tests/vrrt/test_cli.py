@@ -1,4 +1,4 @@
-"""The command, as a user runs it: in its own process, on the packaged problems."""
+"""The command, as a user runs it, on the packaged problems."""
 
 import json
 import os
@@ -56,11 +56,17 @@ def test_packaged_problems_are_solved(tmp_path):
             assert moved.mean() > 0.003
 
 
-def test_without_a_solution_the_exit_code_is_one(tmp_path):
-    done = vrrt("plan", "--problem", PROBLEMS[0], "--out", tmp_path, "--time-limit", 0, "--paper")
-    assert done.returncode == 1
-    assert "TIME_LIMIT" in done.stderr and "raise budget.time_limit_s" in done.stderr
+def test_without_a_solution_the_exit_code_is_one(tmp_path, capsys):
+    command = ["plan", "--problem", PROBLEMS[0], "--out", str(tmp_path)]
+    assert cli.main([*command, "--time-limit", "0", "--paper"]) == 1
+    told = capsys.readouterr().err
+    assert "TIME_LIMIT" in told and "raise budget.time_limit_s" in told
     assert json.loads((tmp_path / "result.json").read_text())["status"] == "TIME_LIMIT"
+
+
+def test_a_process_ends_with_the_exit_code():
+    done = vrrt("plan", "--problem", "nowhere")
+    assert done.returncode == 2 and "no problem at 'nowhere'" in done.stderr
 
 
 def bad(capsys, *arguments):

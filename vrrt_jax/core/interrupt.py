@@ -22,13 +22,13 @@ _interrupted: list[threading.Event] = []  # of the outermost block that runs
 def interruptible() -> Iterator[threading.Event]:
     """Turn Ctrl-C into a flag, so that the best path so far survives it; a second one is fatal.
 
-    Blocks inside each other share the flag.
+    Blocks inside each other share the flag, and so do those of threads that run meanwhile.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield threading.Event()
-        return
     if _interrupted:
         yield _interrupted[0]
+        return
+    if threading.current_thread() is not threading.main_thread():
+        yield threading.Event()
         return
     event = threading.Event()
 

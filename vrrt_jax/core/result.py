@@ -72,6 +72,8 @@ class PlanResult:
     # trees), nodes
     history: np.ndarray
     tree: Tree
+    # Smallest distance of the collision spheres to obstacles on the path [m], where it is measured.
+    clearance: float = float("nan")
 
     @property
     def ok(self) -> bool:

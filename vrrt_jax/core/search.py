@@ -77,14 +77,15 @@ def make_termination(
     min_ratio: float = 1.0,
 ) -> Termination:
     """A stopping rule; without ``patience`` the search never counts as converged."""
-    return Termination(
-        score=jnp.float32(score),
-        settle_iterations=jnp.int32(settle_iterations),
-        max_iterations=jnp.int32(max_iterations),
-        patience=jnp.int32(patience if patience is not None else np.iinfo(np.int32).max),
-        min_improvement=jnp.float32(min_improvement),
-        min_ratio=jnp.float32(min_ratio),
-    )
+    numbers: dict[str, Any] = {
+        "score": np.float32(score),
+        "settle_iterations": np.int32(settle_iterations),
+        "max_iterations": np.int32(max_iterations),
+        "patience": np.int32(patience if patience is not None else np.iinfo(np.int32).max),
+        "min_improvement": np.float32(min_improvement),
+        "min_ratio": np.float32(min_ratio),
+    }
+    return Termination(**numbers)
 
 
 def initial_state(tree: Tree) -> SearchState:

@@ -25,6 +25,9 @@ _NO_ENGINE = (
 )
 
 
+_MARGIN_SHARES = (1.0, 0.5, 0.25, 0.1)  # of the margin that is wanted, the largest that fits
+
+
 @pytree
 class World(PytreeSubclasses, StraightLineEdges):
     """All that planners ask about robot and obstacles.
@@ -84,6 +87,11 @@ def is_free(world: World, q: jax.Array) -> jax.Array:
 
 
 batch_is_free = jax.jit(jax.vmap(is_free, (None, 0)))  # of q (n, D), for the host
+
+
+batch_clearance = jax.jit(  # of q (n, D), the smallest, for the host
+    lambda world, q: jnp.min(jax.vmap(lambda q: world.obstacle_clearance(q))(q))
+)
 
 
 def obstacle_clearance(world: World, q: jax.Array) -> jax.Array:
@@ -175,6 +183,24 @@ def with_obstacles(world: World, obstacles: Sequence[Obstacle]) -> World:
 def with_margin(world: World, margin: float) -> World:
     """The same world, where the robot keeps ``margin`` [m] farther from obstacles and itself."""
     return world.with_margin(margin)
+
+
+def keeping_clearance(world: World, q: np.ndarray, margin: float) -> World:
+    """The world in which the robot keeps ``margin`` [m], or as much as configurations leave.
+
+    Args:
+        world: robot and obstacles.
+        q: (n, D) configurations that have to be free in it.
+        margin: to keep beside the world's own [m].
+
+    Returns:
+        A world with the whole margin or a part of it; the world itself if none is left.
+    """
+    for share in _MARGIN_SHARES if margin > 0 else ():
+        wary = with_margin(world, share * margin)
+        if bool(jnp.all(batch_is_free(wary, jnp.asarray(q, jnp.float32)))):
+            return wary
+    return world
 
 
 def obstacle_list(world: World) -> list[Obstacle]:

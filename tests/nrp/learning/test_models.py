@@ -18,6 +18,8 @@ from nrp_jax.scene.robots import batch_link_features, load_robot
 from nrp_jax.scene.world import build_world, is_free
 from vrrt_jax.core.planners.rrt import sample_configurations
 
+pytestmark = pytest.mark.light_compilation
+
 SIZES = {"snake": (40, 40, 1), "fetch": (40, 40, 20)}
 
 

@@ -9,6 +9,8 @@ from scipy.sparse import csgraph
 
 from nrp_jax.scene import reeds_shepp
 
+pytestmark = pytest.mark.light_compilation
+
 RADIUS = 0.1
 length = jax.jit(lambda a, b: reeds_shepp.length(a, b, RADIUS))
 

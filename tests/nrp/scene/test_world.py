@@ -18,6 +18,8 @@ from nrp_jax.scene.world import CarWorld
 from vrrt_jax.core.edges import free_prefix
 from vrrt_jax.core.planners.rrt import sample_configurations
 
+pytestmark = pytest.mark.light_compilation
+
 MAPS = Path(os.environ.get("NRP_MAPS", "maps-are-elsewhere"))
 
 

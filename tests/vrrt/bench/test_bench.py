@@ -30,6 +30,13 @@ from vrrt_jax.scene.world import obstacle_list
 ROBOTS = tasks.ROBOTS
 
 
+@pytest.fixture(scope="module", autouse=True)
+def renderers():
+    """Renderers keep the meshes of a robot: hundreds of megabytes, of no use to other files."""
+    yield
+    tasks._renderer.cache_clear()
+
+
 @pytest.fixture(scope="module")
 def near_task():
     return tasks.make_task("panda", 0.5, 0, 0, obstacles=True)
@@ -94,6 +101,7 @@ def test_twins_look_alike(near_task, tmp_path, monkeypatch, capsys):
         "panda", near_task
     )  # the goal is half a radian from the start
 
+    tasks._renderer.cache_clear()  # those of the Panda
     monkeypatch.setattr(pose_ambiguity, "ROBOTS", ("ur5e",))
     monkeypatch.setattr(pose_ambiguity, "LEVELS", (2.5,))
     monkeypatch.setattr(pose_ambiguity, "NUM_COMPARED", 1)
@@ -263,6 +271,7 @@ def test_dr_robot_is_a_plain_adam_chain(near_task):
     assert found.loss <= float(goal.loss(world, jnp.asarray(near_task.q_start)))
 
 
+@pytest.mark.light_compilation
 def test_rrt_star_arrives_where_joints_wrap():
     robot, world = tasks.bench_robot("fetch"), tasks.bench_world("fetch", "")
     joint = int(np.flatnonzero(robot.is_continuous)[-1])

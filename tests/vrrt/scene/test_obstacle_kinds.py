@@ -10,6 +10,8 @@ from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.mjx import mjx_is_free, mjx_world
 from vrrt_jax.scene.obstacle_kinds import KINDS, PRISM_SIDES, ObstacleKind, SlotShape
 
+pytestmark = pytest.mark.light_compilation
+
 
 @pytest.mark.parametrize("name", [name for name in KINDS if name != "plane"])
 def test_sizes_survive_a_slot(name):

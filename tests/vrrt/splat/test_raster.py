@@ -14,6 +14,8 @@ from vrrt_jax.splat.camera import look_at
 from vrrt_jax.splat.raster import render
 from vrrt_jax.splat.windows import Windows
 
+pytestmark = pytest.mark.light_compilation
+
 FLOAT32_TOLERANCE = 2e-5  # of images; worst seen 3e-6
 DIFFERENCE_TOLERANCE = 1e-6  # relative, of float64 gradients; worst seen 7e-8
 

@@ -16,6 +16,8 @@ from vrrt_jax.splat.projection import PIXEL_BLUR
 from vrrt_jax.splat.reference import composite, render_reference
 from vrrt_jax.splat.types import SplatModel
 
+pytestmark = pytest.mark.light_compilation
+
 ALPHA_TOLERANCE = 1e-5  # worst seen 3e-6
 DIFFERENCE_TOLERANCE = 1e-6  # relative, of float64 gradients; worst seen 1e-8
 

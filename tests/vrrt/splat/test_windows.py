@@ -13,6 +13,8 @@ from vrrt_jax.splat.lanes import map_lanes
 from vrrt_jax.splat.raster import render
 from vrrt_jax.splat.windows import Windows, choose_windows
 
+pytestmark = pytest.mark.light_compilation
+
 FLOAT32_TOLERANCE = 2e-5  # of images; worst seen 3e-6
 WINDOW_TOLERANCE = 2e-3  # of images; a splat may lose 1e-3 outside its window, worst seen 4e-6
 COSINE, RELATIVE_L2 = 1 - 1e-6, 1e-4  # of float32 gradients; worst seen 1 - 1e-7 and 7e-6

@@ -9,6 +9,8 @@ import vrrt_jax
 from vrrt_jax import ImageGoal, ImageObjective
 from vrrt_jax.visual.problem import make_problem
 
+pytestmark = pytest.mark.light_compilation
+
 IMAGE_PX = QUICK.tree.image_px
 
 

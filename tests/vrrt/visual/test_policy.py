@@ -14,6 +14,8 @@ from vrrt_jax.core.expand import expand
 from vrrt_jax.core.rewire import with_costs
 from vrrt_jax.core.tree import lineage
 
+pytestmark = pytest.mark.light_compilation
+
 CONFIG = QUICK.changed({"seeds.num": 0})
 
 
@@ -22,8 +24,11 @@ def goal(panda, self_model, camera, image):
     return ImageGoal(self_model, camera, image).at(panda, CONFIG.tree.image_px)
 
 
-def grown(world, goal, iterations, **changes):
-    policy = dataclasses.replace(VisualRRT.from_config(CONFIG, world), **changes)
+def grown(world, goal, iterations, *, rewiring=True, **numbers):
+    """A tree after some iterations; of two programs, whatever the numbers are."""
+    changes = {name: jnp.asarray(number) for name, number in numbers.items()}
+    policy = VisualRRT.from_config(CONFIG, world)
+    policy = dataclasses.replace(policy, rewiring=rewiring, **changes)
     tree = policy.init(world, goal, Q_START[None], 1024)
     step = jax.jit(expand)
     for _ in range(iterations):
@@ -61,10 +66,10 @@ def test_a_branch_without_exploration_is_plain_adam(goal, open_world):
         open_world,
         goal,
         6,
-        exploration=jnp.float32(0),
-        kappa=jnp.float32(0.0),
-        eta=jnp.float32(1.0),
-        anneal=jnp.float32(0),
+        exploration=0.0,
+        kappa=0.0,
+        eta=1.0,
+        anneal=0.0,
         rewiring=False,
     )
     adam = optax.scale_by_adam(b1=0.9, b2=0.9)
@@ -84,7 +89,7 @@ def test_a_branch_without_exploration_is_plain_adam(goal, open_world):
 
 
 def test_explored_children_start_fresh_and_step_epsilon(goal, open_world):
-    tree = grown(open_world, goal, 4, exploration=jnp.float32(1.0), rewiring=False)
+    tree = grown(open_world, goal, 4, exploration=1.0, rewiring=False)
     size = int(tree.size)
     assert size == 1 + 4 * QUICK.tree.lanes
     assert np.all(np.asarray(tree.payload.adam.count[:size]) == 0)
@@ -95,7 +100,7 @@ def test_explored_children_start_fresh_and_step_epsilon(goal, open_world):
 
 
 def test_stored_gradients_are_those_of_the_loss(goal, open_world):
-    tree = grown(open_world, goal, 3)
+    tree = grown(open_world, goal, 3, rewiring=False)
     size = int(tree.size)
     expected = jax.jit(jax.vmap(jax.grad(lambda q: goal.loss(open_world, q))))(tree.q[:size])
     np.testing.assert_allclose(tree.payload.grad[:size], expected, rtol=2e-3, atol=1e-5)

@@ -45,22 +45,16 @@ class RRTConnect:
     A node that arrives scores 0.
     """
 
-    MAX_STEP: ClassVar[float] = 0.64  # [rad] of extending lanes
-    MAX_CONNECTION: ClassVar[float] = 2.56  # [rad] of connecting lanes
+    MAX_STEP: ClassVar[float] = 2.56  # [rad] long, as edges are free in large pieces or not at all
 
     margin: Any = 1.0  # how far from the ends half of the samples are drawn [rad]
     lanes: int = static(default=32)
-    edge_steps: int = static(default=128)  # longest edge of a connecting lane, in sub-steps
-    extend_steps: int = static(default=32)  # of an extending lane
+    edge_steps: int = static(default=128)
 
     @classmethod
     def for_world(cls, world: Space, **settings: Any) -> Self:
         """The planner with steps of the same length, however fine the world's checks are."""
-        steps = {
-            "edge_steps": num_checks(world, cls.MAX_CONNECTION),
-            "extend_steps": num_checks(world, cls.MAX_STEP),
-        }
-        return cls(**(steps | settings))
+        return cls(edge_steps=num_checks(world, cls.MAX_STEP), **settings)
 
     def init(
         self, world: Space, goal: ConfigurationGoal, q_roots: Any, capacity: int
@@ -123,13 +117,9 @@ class RRTConnect:
         side = jnp.where(connects, 1 - node.side[chosen], lane % 2)
         nearest = trees.nearest(world, tree, aim, label=node.side, wanted=side)
         parent = jnp.where(connects, chosen, nearest)
-
-        # A connecting lane goes as far as it is free to; an extending lane takes one step.
-        step = world.steer(tree.q[nearest], aim, self.extend_steps)
-        extended = world.end(tree.q[nearest], step)
         return Proposals(
             parent=parent,
-            target=jnp.where(connects[:, None], tree.q[nearest], extended),
+            target=jnp.where(connects[:, None], tree.q[nearest], aim),
             valid=jnp.ones(self.lanes, bool),
             partial=jnp.ones(self.lanes, bool),
             aux=ConnectLanes(

@@ -1,0 +1,128 @@
+"""Plans to joint goals: a search that keeps a clearance where it can, and batches of them."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax.config import PlannerConfig
+from vrrt_jax.core.check_protocols import check_extracted_path
+from vrrt_jax.core.command import usable_cores
+from vrrt_jax.core.goal import ConfigurationGoal
+from vrrt_jax.core.interrupt import interruptible
+from vrrt_jax.core.result import STATUS_OF, PlanResult, Status
+from vrrt_jax.core.search import SearchResult, StopReason, make_termination, search
+from vrrt_jax.core.types import ExpansionPolicy
+from vrrt_jax.outcome import JOINT_ADVICE, Chosen, finish, time_left
+from vrrt_jax.robots.robot import Robot
+from vrrt_jax.scene.world import World, keeping_clearance
+
+WARY_SHARE = 0.15  # of the iterations are searched with a clearance to keep, then without
+
+Progress = Callable[..., Any] | None
+
+
+def plan_to_goal(
+    robot: Robot,
+    world: World,
+    goal: ConfigurationGoal,
+    policy: ExpansionPolicy,
+    q_start: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+    on_progress: Progress,
+) -> PlanResult:
+    """Search, extract the policy's path, shorten and verify it.
+
+    The search keeps ``config.path.margin`` from everything, or less where start or goal are nearer
+    than that. If no path does, it is searched for once more without.
+
+    Args:
+        robot: whose path it is.
+        world: robot and obstacles.
+        goal: inside the limits and free.
+        policy: the planner.
+        q_start: (D,) inside the limits and free.
+        key: random key.
+        config: settings.
+        on_progress: called with the search state and the seconds so far.
+    """
+    wary = keeping_clearance(world, np.stack([q_start, goal.q]), config.path.margin)
+    limit = config.budget.max_iterations
+    first = limit if wary is world else max(int(WARY_SHARE * limit), 1)
+    found, path = _search(wary, goal, policy, q_start, key, first, config, on_progress)
+    if path is None and wary is not world and found.stopped is StopReason.ITERATIONS:
+        config = time_left(config, found.search_s)
+        again, path = _search(world, goal, policy, q_start, key, limit - first, config, on_progress)
+        found = dataclasses.replace(
+            again,
+            compile_s=found.compile_s + again.compile_s,
+            search_s=found.search_s + again.search_s,
+        )
+    end = q_start if path is None else path[-1]
+    chosen = Chosen(
+        path=path,
+        target=np.asarray(goal.q),
+        loss=float(goal.loss(world, jnp.asarray(end))),
+        threshold=float(goal.threshold),
+    )
+    result = finish(robot, world, found, chosen, q_start, key, config)
+    status = result.status
+    if path is None:
+        status = STATUS_OF.get(found.stopped, Status.NO_PATH)
+    return dataclasses.replace(result, status=status, advice=JOINT_ADVICE[status])
+
+
+def _search(
+    world: World,
+    goal: ConfigurationGoal,
+    policy: ExpansionPolicy,
+    q_start: np.ndarray,
+    key: jax.Array,
+    iterations: int,
+    config: PlannerConfig,
+    on_progress: Progress,
+) -> tuple[SearchResult, np.ndarray | None]:
+    found = search(
+        world,
+        goal,
+        policy,
+        policy.init(world, goal, q_start[None], config.tree.capacity),
+        key=key,
+        termination=make_termination(policy.goal_score(goal), max_iterations=iterations),
+        time_limit_s=config.budget.time_limit_s,
+        max_capacity=config.tree.max_capacity,
+        on_progress=on_progress,
+    )
+    path = policy.extract_path(found.tree)
+    check_extracted_path(policy, path, q_start)
+    return found, path
+
+
+def plan_each_to_configuration(
+    robot: Robot,
+    worlds: Sequence[World],
+    goals: Sequence[ConfigurationGoal],
+    policy: ExpansionPolicy,
+    starts: Sequence[np.ndarray],
+    keys: jax.Array,
+    config: PlannerConfig,
+    on_progress: Progress,
+) -> list[PlanResult]:
+    """Q problems on as many threads as there are cores; see ``plan_batch``.
+
+    A search of one problem keeps one core busy. An outer ``vmap`` over problems is slower on a CPU:
+    each of its steps waits for the problem that needs most checks.
+    """
+
+    def plan_one(index: int) -> PlanResult:
+        own = robot, worlds[index], goals[index], policy, starts[index], keys[index]
+        return plan_to_goal(*own, config, on_progress)
+
+    with interruptible(), ThreadPoolExecutor(usable_cores()) as pool:
+        # The first problem compiles what the others use. Ctrl-C ends all, each with its best path.
+        return [plan_one(0), *pool.map(plan_one, range(1, len(goals)))]
