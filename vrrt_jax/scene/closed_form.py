@@ -139,7 +139,8 @@ def sphere_fields(
     # A held object is checked against all other links, and against what these hold.
     first, second = np.asarray(robot.self_collision_pairs, int).reshape(-1, 2).T
     held = together(attached, with_corners=False)
-    link, center, radius = _joined(robot.self_collision_spheres, held)
+    alone = [_without_others(robot)] if attached else []
+    link, center, radius = _joined(robot.self_collision_spheres, *alone, held)
     contact_distance = np.zeros((len(radius), len(radius)), np.float32)
     contact_distance[first, second] = radius[first] + radius[second]
     num_own = len(radius) - len(held.radius)
@@ -166,13 +167,21 @@ def sphere_fields(
     return {name: jnp.asarray(value, jnp.float32) for name, value in fields.items()}
 
 
-def _joined(own: Spheres, held: HeldSpheres) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Links (n,), centers (n, 3) and radii (n,) of the robot's spheres and of those that it holds.
+def _without_others(robot: Any) -> HeldSpheres:
+    """Collision spheres of links that have no self-collision spheres.
 
-    The single precision of the robot's own is kept.
+    These links touch no other ones, but what is held may touch them.
     """
+    spheres = robot.collision_spheres
+    link, center, radius = (np.asarray(x) for x in (spheres.link, spheres.center, spheres.radius))
+    is_alone = ~np.isin(link, np.asarray(robot.self_collision_spheres.link))
+    return HeldSpheres(link=link[is_alone], center=center[is_alone], radius=radius[is_alone])
+
+
+def _joined(*parts: Spheres | HeldSpheres) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Links (n,), centers (n, 3) and radii (n,) of several sets of spheres, in single precision."""
     return (
-        np.concatenate([np.asarray(own.link), held.link]),
-        np.concatenate([np.asarray(own.center), held.center.astype(np.float32)]),
-        np.concatenate([np.asarray(own.radius), held.radius.astype(np.float32)]),
+        np.concatenate([np.asarray(part.link) for part in parts]),
+        np.concatenate([np.asarray(part.center, np.float32) for part in parts]),
+        np.concatenate([np.asarray(part.radius, np.float32) for part in parts]),
     )

@@ -11,9 +11,10 @@ from vrrt_jax.scene.held import HeldObject
 from vrrt_jax.scene.obstacle_kinds import KINDS
 
 # contype and conaffinity of held objects. Meshes see everything. Among spheres they see obstacles
-# and self-collision spheres, as the robot's links do, but no collision spheres.
-_THIN = int(mjcf_writer.SELF_COLLISION_GEOM["contype"])
-HELD_BITS = {"meshes": (ALL_BITS, ALL_BITS), "spheres": (_THIN, _THIN | 1)}
+# and self-collision spheres, as the robot's links do. A bit of their own is for collision spheres
+# of links that have no others.
+_THIN, _OWN = int(mjcf_writer.SELF_COLLISION_GEOM["contype"]), 4
+HELD_BITS = {"meshes": (ALL_BITS, ALL_BITS), "spheres": (_THIN | _OWN, _THIN | 1)}
 
 
 def add_held(
@@ -52,6 +53,8 @@ def add_held(
             conaffinity=conaffinity,
         )
         names.append(body.name)
+    for geom in _alone(spec) if held else ():
+        geom.conaffinity |= _OWN
     # MuJoCo skips neighbors along the chain, which may touch at their joint. A held object has no
     # joint with the link before: pairs of geoms bring that check back.
     for name in names:
@@ -59,6 +62,16 @@ def add_held(
             if (bits[0] & geom.conaffinity) | (geom.contype & bits[1]):
                 spec.add_pair(geomname1=name, geomname2=geom.name)
     return names
+
+
+def _alone(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
+    """Collision spheres on links without self-collision spheres."""
+    of_kind = [
+        [geom for geom in spec.geoms if geom.group == int(kind["group"])]
+        for kind in (mjcf_writer.COLLISION_GEOM, mjcf_writer.SELF_COLLISION_GEOM)
+    ]
+    links = {_moved(spec, geom.parent).name for geom in of_kind[1]}
+    return [geom for geom in of_kind[0] if _moved(spec, geom.parent).name not in links]
 
 
 def _geoms_before(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> Iterator[mujoco.MjsGeom]:
