@@ -15,6 +15,7 @@ A frame or a joint's attribute that the mobile robot's file states itself wins.
 from collections.abc import Iterator
 from xml.etree import ElementTree
 
+from vrrt_jax.robots.mjcf_writer import FROZEN
 from vrrt_jax.robots.packaged import robot_path, scenes_dir
 
 _FRAME = ("pos", "quat")
@@ -35,9 +36,19 @@ def mobile_mjcf(name: str) -> str:
     if arm_name is None:
         return text
     arm = ElementTree.parse(robot_path(arm_name.get("data", ""))).getroot()
+    _drop_fixed_joints(arm)
     _attach(root, next(arm.iter("worldbody")))
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode")
+
+
+def _drop_fixed_joints(arm: ElementTree.Element) -> None:
+    """Delete the joints of an arm's file that are not planned, in place."""
+    fixed = {number.get("name", "").removeprefix(FROZEN) for number in arm.iter("numeric")}
+    for body in arm.iter("body"):
+        for joint in body.findall("joint"):
+            if joint.get("name") in fixed:
+                body.remove(joint)
 
 
 def _attach(root: ElementTree.Element, arm: ElementTree.Element) -> None:

@@ -283,7 +283,8 @@ def frozen_positions(
         Positions [rad] or [m] by joint: those of ``freeze``, and joints that an equality couples.
 
     Raises:
-        ValueError: a joint of ``freeze`` does not exist or the value is no finite number.
+        ValueError: a joint of ``freeze`` does not exist, or its value is no finite number or
+            outside of its range.
     """
     names = [model.joint(j).name for j in range(model.njnt)]
     frozen = dict(freeze or {})
@@ -293,6 +294,13 @@ def frozen_positions(
         if not np.isfinite(value):
             raise ValueError(
                 f"freeze: joint '{name}' got {value}; expected a finite position [rad] or [m]"
+            )
+        joint = model.joint(name)
+        low, high = joint.range
+        if model.jnt_limited[joint.id] and not low <= value <= high:
+            raise ValueError(
+                f"freeze: joint '{name}' got {value:g}; expected a position in its range, "
+                f"[{low:g}, {high:g}]"
             )
     coupled = {}
     for k in range(model.neq):

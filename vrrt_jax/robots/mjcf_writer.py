@@ -16,7 +16,7 @@ SELF_COLLISION_GEOM = {"group": "4", "contype": "2", "conaffinity": "2"}
 # The names of both kinds in the text: packaged files carry them.
 _CLASSES = (("cover", COLLISION_GEOM), ("thin", SELF_COLLISION_GEOM))
 _SOURCE = "mesh_source"
-_FROZEN = "frozen: "
+FROZEN = "frozen: "  # before the names of joints, in custom numbers: where each is fixed
 
 
 def collision_mjcf(
@@ -69,7 +69,7 @@ def collision_mjcf(
     if mesh_source is not None:
         ET.SubElement(custom, "text", name=_SOURCE, data=mesh_source)
     for joint, position in frozen.items():
-        ET.SubElement(custom, "numeric", name=_FROZEN + joint, data=_numbers(position))
+        ET.SubElement(custom, "numeric", name=FROZEN + joint, data=_numbers(position))
     contact = ET.SubElement(root, "contact")
     for first, second in ignored_pairs:
         ET.SubElement(contact, "exclude", body1=first, body2=second)
@@ -82,9 +82,9 @@ def source_of(spec: mujoco.MjSpec) -> tuple[str | None, dict[str, float]]:
     """The ``mesh_source`` and ``frozen`` that :func:`collision_mjcf` kept, else None and {}."""
     sources = [element.data for element in spec.texts if element.name == _SOURCE]
     frozen = {
-        element.name.removeprefix(_FROZEN): float(element.data[0])
+        element.name.removeprefix(FROZEN): float(element.data[0])
         for element in spec.numerics
-        if element.name.startswith(_FROZEN)
+        if element.name.startswith(FROZEN)
     }
     return (sources[0] if sources else None), frozen
 

@@ -210,8 +210,9 @@ def _distances(
     obstacles: Sequence[Obstacle], to_world: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
     """Distances (n, K) of points (n, 3) in a frame that has a pose (4, 4) to obstacles [m]."""
-    points = jnp.asarray(_moved(to_world, points).T, jnp.float32)
-    return np.asarray(signed_distances(to_slots(obstacles, len(obstacles)), points), np.float64)
+    slots = to_slots(obstacles, len(obstacles))
+    centers = jnp.asarray(_moved(to_world, points).T, jnp.float32)
+    return np.asarray(signed_distances(slots, centers), np.float64)
 
 
 def _checked(world: World, q: Any) -> np.ndarray:

@@ -78,7 +78,7 @@ class ClosedFormWorld(World):
         """See :meth:`vrrt_jax.scene.world.World.holding`."""
         fields = sphere_fields(self.robot.value, attached, len(self.obstacles.rounding))
         world = dataclasses.replace(self, attached=TraceIgnoredNames(attached), **fields)
-        world = dataclasses.replace(world.with_margin(self.self_margin), margin=self.margin)
+        world = dataclasses.replace(world.with_margin(float(self.self_margin)), margin=self.margin)
         return dataclasses.replace(world, **world.fields_of(self.obstacle_names))
 
     def fields_of(self, names: Sequence[str]) -> dict[str, Any]:
