@@ -28,6 +28,7 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--problem", help="a packaged problem, or a folder with problem.json")
     _add_robot(plan, required=False)
     plan.add_argument("--world", help="an MJCF file of obstacles, or a packaged world")
+    plan.add_argument("--engine", default="mjx", help="collision checks: mjx, closed_form")
     plan.add_argument("--goal", nargs="+", help="goal images, RGB with mask or plain background")
     plan.add_argument("--camera", nargs="+", help="a JSON file for each goal image")
     plan.add_argument("--start", type=_numbers, help="start configuration, as --start=0,0.3,...")
@@ -68,6 +69,8 @@ def _parser() -> argparse.ArgumentParser:
         speed = kinds.add_parser(what, help="how fast this machine is")
         speed.set_defaults(run=_speed)
         speed.add_argument("--json", help="write the figures here")
+        if what == "search":
+            speed.add_argument("--engine", default="mjx", help="collision checks: mjx, closed_form")
     twins = kinds.add_parser("twins", help="how alike a robot looks after half a turn of its wrist")
     twins.set_defaults(run=_twins)
     twins.add_argument("--tasks-per-level", type=int, default=20, help="tasks at each distance")
@@ -113,6 +116,7 @@ def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument("--azimuth", type=float, default=0.0, help="turn the cameras [degree]")
     parser.add_argument("--light", type=float, default=1.0, help="brightness of the lamp")
     parser.add_argument("--occluded", action="store_true", help="obstacles hide the robot")
+    parser.add_argument("--engine", default="mjx", help="collision checks: mjx, closed_form")
     parser.add_argument("--time-limit", type=float, default=60.0, help="of one search [s]")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--json", help="write results here; go on from what it holds")
@@ -193,7 +197,7 @@ def _problem(arguments: argparse.Namespace):
         if given:
             options = ", --".join(given).replace("_", "-")
             raise ValueError(f"give either --problem or --{options}, not both")
-        return problems.load_problem(arguments.problem)
+        return problems.load_problem(arguments.problem, engine=arguments.engine)
     missing = [name for name in parts if name not in given]
     if missing:
         raise ValueError(
@@ -209,7 +213,7 @@ def _problem(arguments: argparse.Namespace):
     return problems.Problem(
         name=Path(arguments.goal[0]).stem,
         robot=robot,
-        world=problems.load_world(arguments.world, robot),
+        world=problems.load_world(arguments.world, robot, engine=arguments.engine),
         self_model=load_self_model(problems.self_model_path(robot, arguments.self_model)),
         cameras=tuple(
             problems.camera_from_dict(problems.read_json(path), image.shape[:2])
@@ -304,7 +308,9 @@ def _meshes(robot):
 def _speed(arguments: argparse.Namespace) -> int:
     import importlib
 
-    return _figures(importlib.import_module(f"vrrt_jax.bench.{arguments.what}").run(), arguments)
+    chosen = {"engine": arguments.engine} if arguments.what == "search" else {}
+    bench = importlib.import_module(f"vrrt_jax.bench.{arguments.what}")
+    return _figures(bench.run(**chosen), arguments)
 
 
 def _twins(arguments: argparse.Namespace) -> int:
@@ -329,7 +335,7 @@ def _protocol(arguments: argparse.Namespace) -> int:
 
     if arguments.jobs < 1:
         raise ValueError(f"--jobs is {arguments.jobs}; expected at least 1")
-    choices = ("method", "config", "only")
+    choices = ("method", "config", "only", "engine")
     chosen = {name: getattr(arguments, name) for name in choices if hasattr(arguments, name)}
     benchmark = protocol.benchmark(
         arguments.what,
