@@ -34,9 +34,9 @@ _REDUCTIONS = {
 # These name axes of their operand by number, which a further axis at the end does not change.
 _BY_AXIS = frozenset((*_REDUCTIONS, "cumsum", "rev", "squeeze"))
 _SHORT = 8  # an axis of at most this length is unrolled
-# After these XLA must not fuse, or consumers recompute what led to them. A barrier that XLA's CPU
-# backend respects is a copy: only arrays with more axes than this (the batch included) get one.
-_COSTLY = frozenset(("argmax", "argmin", "concatenate", "gather"))
+# After a gather of at least this many axes (the batch included) XLA must not fuse, or its consumers
+# repeat it. The barrier that XLA's CPU backend respects is a copy: others get the one that it does
+# not, which is enough to keep it from taking concatenated arrays apart again.
 _MANY_AXES = 4
 
 
@@ -93,17 +93,17 @@ class _Evaluation:
         else:
             found = primitive.bind(*(value.array for value in inputs), **equation.params)
         arrays = found if primitive.multiple_results else [found]
-        if is_batched and primitive.name in _COSTLY:
-            arrays = [self.barrier(array) for array in arrays]
+        if is_batched and primitive.name in ("concatenate", "gather"):
+            arrays = [self.barrier(array, primitive.name == "gather") for array in arrays]
         return [Value(array, is_batched) for array in arrays]
 
-    def barrier(self, array: jax.Array) -> jax.Array:
+    def barrier(self, array: jax.Array, is_gather: bool) -> jax.Array:
         """The same array, behind a barrier against fusion."""
         if not jnp.issubdtype(array.dtype, jnp.floating):
             return array
-        if array.ndim < _MANY_AXES:
-            return lax.optimization_barrier(array)
-        return lax.cond(self.is_true, lambda x: x, jnp.zeros_like, array)
+        if is_gather and array.ndim >= _MANY_AXES:
+            return lax.cond(self.is_true, lambda x: x, jnp.zeros_like, array)
+        return lax.optimization_barrier(array)
 
     def wide(self, value: Value, shape: Sequence[int]) -> jax.Array:
         """A value of a shape as an array of that shape and the batch."""

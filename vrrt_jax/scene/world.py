@@ -152,7 +152,7 @@ def with_obstacles(world: World, obstacles: Sequence[Obstacle]) -> World:
     """The same robot among other obstacles.
 
     Nothing re-compiles, but where the engine is "mjx" and there are more obstacles of a kind than
-    there is room for: room comes in fours.
+    there is room for: room comes in fours, for boxes in twos.
 
     Raises:
         ValueError: more obstacles than slots, a name used twice, an unsupported kind or a size that
