@@ -105,7 +105,8 @@ def build_world(
     Args:
         robot: from :func:`vrrt_jax.load_robot`.
         obstacles: what stands around it.
-        engine: who answers what is free: "mjx", or "closed_form", which is faster.
+        engine: who answers what is free: "mjx", or "closed_form", which
+            compiles sooner and is faster among many boxes.
         num_slots: room for obstacles; raised to the next multiple of 8 that holds them all. Worlds
             of one robot with as many slots share their compiled functions.
         margin: clearance asked of obstacles [m].
