@@ -179,7 +179,8 @@ class MjxScene:
                     return are_free(*row)
 
                 return jax.lax.map(one, jnp.arange(size)), True
-            return are_free(others, q.reshape(-1, q.shape[-1])).reshape(size, -1), True
+            flat = q.reshape(size * q.shape[1], q.shape[2])
+            return are_free(others, flat).reshape(size, q.shape[1]), True
 
         return are_free
 
@@ -194,6 +195,8 @@ def _are_free(scene: MjxScene, others: Any, q: jax.Array) -> jax.Array:
         (free,) = evaluate(scene.program, inputs, len(q), seed=q[0, 0])
         return jnp.broadcast_to(free.array, len(q))
 
+    if len(q) == 0:
+        return jnp.zeros(0, bool)
     # Blocks of equal size; the last is filled up with zeros.
     num_blocks = max(-(-len(q) // _BLOCK), 1) if jax.default_backend() == "cpu" else 1
     if num_blocks == 1:

@@ -208,6 +208,7 @@ def test_every_way_of_asking_gets_the_same_answer(panda, roomy, rng):
     np.testing.assert_array_equal(both, [expected, batch_is_free(roomy, q)])
     slope = jax.grad(lambda q: jnp.where(world.is_free(q), q.sum(), 2 * q.sum()))(q[0])
     np.testing.assert_array_equal(slope, np.full(7, 1.0 if expected[0] else 2.0))
+    assert batch_is_free(world, q[:0]).shape == (0,)
     # One configuration that is not finite spoils no other.
     spoiled = np.asarray(batch_is_free(world, q.at[0].set(jnp.nan)))
     assert not spoiled[0]
