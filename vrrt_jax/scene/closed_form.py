@@ -1,46 +1,37 @@
-"""The fast engine: distances of spheres to obstacles in closed form.
+"""The fast engine: distances of spheres to obstacles in closed form, exact and smooth.
 
-Distances are exact and smooth, whereas MJX's collision functions give only a sign for boxes and
-cost many times as much; :mod:`vrrt_jax.scene.mjx` checks one against the other.
+It agrees with :mod:`vrrt_jax.scene.mjx`, the default engine.
 """
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from vrrt_jax.core.check_protocols import overrides_is_free
 from vrrt_jax.core.types import pytree
-from vrrt_jax.robots.kinematics import Spheres, lever_arms, link_poses, place, placement
-from vrrt_jax.scene.obstacles import signed_distances
+from vrrt_jax.robots.kinematics import link_poses, place
+from vrrt_jax.scene.spheres import WorldSpheres, world_spheres
 from vrrt_jax.scene.world import World
-
-ROUNDING = 0.999  # of spans: what single precision may round
 
 
 @pytree
 class ClosedFormWorld(World):
-    """A world whose robot is two sets of spheres.
+    """A world whose robot is two sets of spheres."""
 
-    Letters: ``n`` collision spheres, ``m`` self-collision spheres.
-    """
+    engine: ClassVar[str] = "closed_form"
 
-    collision_spheres: jax.Array  # (L * 12, 3 n) their placement, see ``kinematics.placement``
-    collision_radius: jax.Array  # (n,) [m]
-    self_collision_spheres: jax.Array  # (L * 12, 3 m) placement of these
-    contact_distance: jax.Array  # (m, m) at which two of them touch, 0 for unchecked pairs [m]
-    # How far a collision sphere moves, and how much the distance of two self-collision spheres
-    # changes, at most while one joint moves by one, see ``kinematics.lever_arms``.
-    lever_arms: jax.Array  # (D, n) [m/rad] or [m/m]
-    relative_lever_arms: jax.Array  # (D, m, m) the same units
+    spheres: WorldSpheres
 
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.is_free`."""
-        poses = link_poses(self.chain, q)
-        return (self._clearance(poses) > self.margin) & (self._self_gap(poses) >= 0)
+        poses, spheres = link_poses(self.chain, q), self.spheres
+        clearance = spheres.clearances(self.obstacles, place(spheres.collision, poses))
+        gap = spheres.squared_gaps(place(spheres.self_collision, poses))
+        # A robot of few links may have no pair to check: then nothing can touch.
+        return (jnp.min(clearance) > self.margin) & (jnp.min(gap, initial=jnp.inf) >= 0)
 
     def free_span(self, q: jax.Array, edge: jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`: distances divided by the speeds of the spheres.
@@ -49,47 +40,19 @@ class ClosedFormWorld(World):
         """
         if overrides_is_free(self):
             return super().free_span(q, edge)
-        poses = link_poses(self.chain, q)
-        clearance = self._clearances(poses) - self.margin
-        # Self-collision: pairs that are not checked are infinitely far apart.
-        centers = place(self.self_collision_spheres, poses)
-        apart = jnp.sqrt(sum((axis[:, None] - axis[None]) ** 2 for axis in centers) + 1e-12)
-        gap = jnp.where(self.contact_distance > 0, apart - self.contact_distance, jnp.inf)
-        speed, relative_speed = (
-            jnp.tensordot(jnp.abs(edge), arms, 1) + 1e-9
-            for arms in (self.lever_arms, self.relative_lever_arms)
-        )
-        span = jnp.minimum(
-            jnp.min(clearance / speed), jnp.min(gap / relative_speed, initial=jnp.inf)
-        )
-        is_free = (jnp.min(clearance) > 0) & (jnp.min(gap, initial=jnp.inf) >= 0)
-        return jnp.where(is_free, ROUNDING * span, -1.0)
+        poses, spheres = link_poses(self.chain, q), self.spheres
+        centers = place(spheres.collision, poses), place(spheres.self_collision, poses)
+        return spheres.free_span(self.obstacles, self.margin, centers, edge)
 
     def obstacle_clearance(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.obstacle_clearance`."""
-        return self._clearance(link_poses(self.chain, q))
+        centers = place(self.spheres.collision, link_poses(self.chain, q))
+        return jnp.min(self.spheres.clearances(self.obstacles, centers))
 
     def with_margin(self, margin: float) -> Self:
         """See :func:`vrrt_jax.scene.world.with_margin`."""
-        # A contact distance of zero marks a pair that is not checked, and must stay zero.
-        wider = jnp.where(self.contact_distance > 0, self.contact_distance + margin, 0.0)
-        return dataclasses.replace(self, margin=self.margin + margin, contact_distance=wider)
-
-    def _clearance(self, poses: jax.Array) -> jax.Array:
-        """Smallest distance () between collision spheres and obstacles [m]."""
-        return jnp.min(self._clearances(poses))
-
-    def _clearances(self, poses: jax.Array) -> jax.Array:
-        """Distances (n,) of the collision spheres to the nearest obstacle [m]."""
-        distances = signed_distances(self.obstacles, place(self.collision_spheres, poses))
-        return jnp.min(distances, axis=1) - self.collision_radius
-
-    def _self_gap(self, poses: jax.Array) -> jax.Array:
-        """Smallest difference () of squared distance and squared contact distance [m^2]."""
-        centers = place(self.self_collision_spheres, poses)
-        apart = sum((axis[:, None] - axis[None]) ** 2 for axis in centers)
-        # A robot of few links may have no pair to check: then nothing can touch.
-        return jnp.min(apart - self.contact_distance**2, initial=jnp.inf)
+        spheres = self.spheres.farther_apart(margin)
+        return dataclasses.replace(self, margin=self.margin + margin, spheres=spheres)
 
 
 def closed_form_world(robot: Any, fields: Mapping[str, Any]) -> ClosedFormWorld:
@@ -99,30 +62,4 @@ def closed_form_world(robot: Any, fields: Mapping[str, Any]) -> ClosedFormWorld:
         robot: from :func:`vrrt_jax.load_robot`.
         fields: of :class:`vrrt_jax.scene.world.World`.
     """
-    radius = np.asarray(robot.self_collision_spheres.radius)
-    first, second = np.asarray(robot.self_collision_pairs, int).reshape(-1, 2).T
-    contact_distance = np.zeros((len(radius), len(radius)), np.float32)
-    contact_distance[first, second] = radius[first] + radius[second]
-
-    def arms(spheres: Spheres) -> np.ndarray:
-        link, center = np.asarray(spheres.link), np.asarray(spheres.center)
-        return lever_arms(robot.chain, link, center, robot.lower, robot.upper)
-
-    # Only joints between two spheres change their distance: those that carry just one of them.
-    own = arms(robot.self_collision_spheres)
-    relative = np.where(own[:, :, None] > 0, own[:, :, None], own[:, None])
-    relative[(own[:, :, None] > 0) & (own[:, None] > 0)] = 0.0
-
-    def placed(spheres: Spheres) -> jax.Array:
-        link, center = np.asarray(spheres.link), np.asarray(spheres.center)
-        return jnp.asarray(placement(link, center, robot.chain.num_links))
-
-    return ClosedFormWorld(
-        collision_spheres=placed(robot.collision_spheres),
-        collision_radius=robot.collision_spheres.radius,
-        self_collision_spheres=placed(robot.self_collision_spheres),
-        contact_distance=jnp.asarray(contact_distance),
-        lever_arms=jnp.asarray(arms(robot.collision_spheres), jnp.float32),
-        relative_lever_arms=jnp.asarray(relative, jnp.float32),
-        **fields,
-    )
+    return ClosedFormWorld(spheres=world_spheres(robot), **fields)
