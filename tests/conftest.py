@@ -81,7 +81,7 @@ def wall_world(panda):
             size=(0.04, 0.2, 0),
         ),
     ]
-    return vrrt_jax.build_world(panda, obstacles)
+    return vrrt_jax.build_world(panda, obstacles, engine="closed_form")
 
 
 @pytest.fixture(scope="session")

@@ -35,6 +35,7 @@ from vrrt_jax.robots import Robot, load_robot, robot_names  # noqa: E402
 from vrrt_jax.robots.kinematics import link_poses  # noqa: E402
 from vrrt_jax.scene.attached import attach, detach  # noqa: E402
 from vrrt_jax.scene.closed_form import ClosedFormWorld  # noqa: E402
+from vrrt_jax.scene.mjx import MjxWorld  # noqa: E402
 from vrrt_jax.scene.obstacles import Obstacle  # noqa: E402
 from vrrt_jax.scene.verify import verify_path  # noqa: E402
 from vrrt_jax.scene.world import (  # noqa: E402
@@ -68,6 +69,7 @@ __all__ = [
     "ImageObjective",
     "LeastSquaresGoal",
     "MatchConfig",
+    "MjxWorld",
     "Obstacle",
     "PLANNERS",
     "PlanResult",

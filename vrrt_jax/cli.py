@@ -28,6 +28,7 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--problem", help="a packaged problem, or a folder with problem.json")
     add_robot(plan, required=False)
     plan.add_argument("--world", help="an MJCF file of obstacles, or a packaged world")
+    plan.add_argument("--engine", default="mjx", help="collision checks: mjx, closed_form")
     plan.add_argument("--goal", nargs="+", help="goal images, RGB with mask or plain background")
     plan.add_argument("--camera", nargs="+", help="a JSON file for each goal image")
     plan.add_argument(
@@ -149,7 +150,7 @@ def _problem(arguments: argparse.Namespace):
         if given:
             options = ", --".join(given).replace("_", "-")
             raise ValueError(f"give either --problem or --{options}, not both")
-        return problems.load_problem(arguments.problem)
+        return problems.load_problem(arguments.problem, engine=arguments.engine)
     missing = [name for name in parts if name not in given]
     if missing:
         raise ValueError(
@@ -165,7 +166,7 @@ def _problem(arguments: argparse.Namespace):
     return problems.Problem(
         name=Path(arguments.goal[0]).stem,
         robot=robot,
-        world=problems.load_world(arguments.world, robot),
+        world=problems.load_world(arguments.world, robot, engine=arguments.engine),
         self_model=load_self_model(problems.self_model_path(robot, arguments.self_model)),
         cameras=tuple(
             problems.camera_from_dict(problems.read_json(path), image.shape[:2])

@@ -42,12 +42,16 @@ def problem_names() -> list[str]:
     return sorted(p.parent.name for p in (scenes_dir() / "problems").glob("*/problem.json"))
 
 
-def load_problem(name_or_path: str | Path) -> Problem:
+def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
     """Load a packaged problem by name, or any by its folder.
+
+    Args:
+        name_or_path: a packaged problem, or a folder with a ``problem.json``.
+        engine: of its world, see :func:`build_world`.
 
     Raises:
         FileNotFoundError: there is no such problem, or one of its files is missing.
-        ValueError: a file is damaged or a field is missing.
+        ValueError: a file is damaged, a field is missing, or the engine does not exist.
     """
     folder = Path(name_or_path)
     if not (folder / "problem.json").is_file() and str(name_or_path) in problem_names():
@@ -72,7 +76,7 @@ def load_problem(name_or_path: str | Path) -> Problem:
         return Problem(
             name=folder.resolve().name,
             robot=robot,
-            world=load_world(_beside(folder, fields["world"]), robot),
+            world=load_world(_beside(folder, fields["world"]), robot, engine=engine),
             self_model=load_self_model(self_model_path(robot, self_model)),
             cameras=cameras,
             goal_images=images,
@@ -83,17 +87,21 @@ def load_problem(name_or_path: str | Path) -> Problem:
         raise ValueError(f"'{file}' lacks the field {error}; see the packaged problems") from None
 
 
-def load_world(name_or_path: str | Path, robot: Robot, **settings: Any) -> World:
+def load_world(
+    name_or_path: str | Path, robot: Robot, *, engine: str = "mjx", **settings: Any
+) -> World:
     """Load a world of obstacles from an MJCF file, or a packaged one by name, for a robot.
 
     Args:
         name_or_path: a file, or the name of one in ``scenes/worlds``.
         robot: from :func:`load_robot`.
+        engine: who answers what is free, see :func:`build_world`.
         settings: passed on to :func:`build_world`.
 
     Raises:
         FileNotFoundError: no such world.
-        ValueError: the file is no MJCF, or holds what cannot be collided with.
+        ValueError: the file is no MJCF, or holds what cannot be collided with, or the engine does
+            not exist.
     """
     path = Path(name_or_path)
     packaged = scenes_dir() / "worlds" / f"{name_or_path}.xml"
@@ -104,7 +112,7 @@ def load_world(name_or_path: str | Path, robot: Robot, **settings: Any) -> World
         raise FileNotFoundError(
             f"no world at '{name_or_path}'; packaged ones: {', '.join(names)}, or give an MJCF file"
         )
-    return build_world(robot, load_obstacles(path), **settings)
+    return build_world(robot, load_obstacles(path), engine=engine, **settings)
 
 
 def self_model_path(robot: Robot, given: str | Path | None = None) -> Path:

@@ -25,4 +25,4 @@ def image(panda, self_model, camera):
 @pytest.fixture(scope="session")
 def open_world(panda):
     ball = vrrt_jax.Obstacle(name="ball", kind="sphere", position=(0, 0.9, 0.9), size=(0.1, 0, 0))
-    return vrrt_jax.build_world(panda, [ball])
+    return vrrt_jax.build_world(panda, [ball], engine="closed_form")

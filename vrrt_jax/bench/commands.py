@@ -19,6 +19,8 @@ def add_bench(kinds: Any) -> None:
         speed = kinds.add_parser(what, help="how fast this machine is")
         speed.set_defaults(run=_speed)
         speed.add_argument("--json", help="write the figures here")
+        if what == "search":
+            _add_engine(speed)
     twins = kinds.add_parser("twins", help="how alike a robot looks after half a turn of its wrist")
     twins.set_defaults(run=_twins)
     twins.add_argument("--tasks-per-level", type=int, default=20, help="tasks at each distance")
@@ -62,9 +64,14 @@ def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument("--azimuth", type=float, default=0.0, help="turn the cameras [degree]")
     parser.add_argument("--light", type=float, default=1.0, help="brightness of the lamp")
     parser.add_argument("--occluded", action="store_true", help="obstacles hide the robot")
+    _add_engine(parser)
     parser.add_argument("--time-limit", type=float, default=60.0, help="of one search [s]")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--json", help="write results here; go on from what it holds")
+
+
+def _add_engine(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--engine", default="mjx", help="collision checks: mjx, closed_form")
 
 
 def _add_arm(parser: argparse.ArgumentParser) -> None:
@@ -79,7 +86,7 @@ def _add_arm(parser: argparse.ArgumentParser) -> None:
         help="where the robot's base link stands in the files, as --base=x,y,z,yaw [m, rad]",
     )
     parser.add_argument("--planner", default="rrt-connect", help="rrt-connect, rrt or rrt-star")
-    parser.add_argument("--engine", help="of collision; the usual one by default")
+    _add_engine(parser)
     parser.add_argument("--limit", type=int, help="problems of each file, evenly taken")
     parser.add_argument("--batch", type=int, help="measure the rate of batches of so many too")
     parser.add_argument("--peers", action="store_true", help="OMPL's planners too")
@@ -91,7 +98,9 @@ def _add_arm(parser: argparse.ArgumentParser) -> None:
 def _speed(arguments: argparse.Namespace) -> int:
     import importlib
 
-    return _figures(importlib.import_module(f"vrrt_jax.bench.{arguments.what}").run(), arguments)
+    chosen = {"engine": arguments.engine} if arguments.what == "search" else {}
+    bench = importlib.import_module(f"vrrt_jax.bench.{arguments.what}")
+    return _figures(bench.run(**chosen), arguments)
 
 
 def _twins(arguments: argparse.Namespace) -> int:
@@ -116,7 +125,7 @@ def _protocol(arguments: argparse.Namespace) -> int:
 
     if arguments.jobs < 1:
         raise ValueError(f"--jobs is {arguments.jobs}; expected at least 1")
-    choices = ("method", "config", "only")
+    choices = ("method", "config", "only", "engine")
     chosen = {name: getattr(arguments, name) for name in choices if hasattr(arguments, name)}
     benchmark = protocol.benchmark(
         arguments.what,

@@ -77,6 +77,7 @@ def solve(
     seed: int,
     guess_sigma: float = 0.0,
     collisions: bool = True,
+    engine: str = "mjx",
 ) -> dict[str, Any]:
     """Run a method on a task and judge the outcome as the paper does.
 
@@ -89,11 +90,12 @@ def solve(
         seed: of the method; the task's index is folded in.
         guess_sigma: if positive, Visual-RRT is also told the goal with that much noise [rad].
         collisions: False judges the pose alone.
+        engine: of the world that is planned in.
 
     Returns:
         A row for the results file.
     """
-    robot, world = bench_robot(robot_name), bench_world(robot_name, task.world)
+    robot, world = bench_robot(robot_name), bench_world(robot_name, task.world, engine)
     images, masks = goal_images(robot_name, task, scenery)
     task_seed = zlib.crc32(f"{seed} {task.level:.3f} {task.index}".encode())
     key = jax.random.key(task_seed)

@@ -7,6 +7,7 @@ from vrrt_jax.bench.methods import CONFIGS, METHODS
 from vrrt_jax.bench.runner import Benchmark, Variant
 from vrrt_jax.bench.tasks import ROBOTS, Scenery
 from vrrt_jax.config import PlannerConfig
+from vrrt_jax.scene.world import ENGINES
 
 # By the settings that are varied, one by one. Of the paper's, the values that the paper varies; of
 # the default, what it does and the paper does not: each is taken away, after the whole.
@@ -47,6 +48,7 @@ def benchmark(
     method: str = "vrrt",
     config: str = "default",
     only: str | None = None,
+    engine: str = "mjx",
     scenery: Scenery | None = None,
     time_limit_s: float = 60.0,
 ) -> Benchmark:
@@ -61,6 +63,7 @@ def benchmark(
         method: one of :data:`~vrrt_jax.bench.methods.METHODS`.
         config: "default" or "paper"; what an ablation varies.
         only: one of its settings, all of them if None.
+        engine: of the world that is planned in.
         scenery: what goal images look like.
         time_limit_s: of one search [s].
 
@@ -71,6 +74,7 @@ def benchmark(
         ("robot", robot, ROBOTS),
         ("method", method, METHODS),
         ("config", config, CONFIGS),
+        ("engine", engine, ENGINES),
         ("ablation", only, (None, *map(_short, ABLATIONS.get(config, ())), "guess")),
     ):
         if value not in known:
@@ -90,6 +94,7 @@ def benchmark(
         levels=tuple(levels),
         tasks_per_level=tasks_per_level,
         seed=seed,
+        engine=engine,
         variants=_ablations(config, only, base.config) if what == "ablation" else (base,),
         scenery=scenery or Scenery(),
     )

@@ -45,6 +45,7 @@ class Benchmark:
     seed: int
     variants: tuple[Variant, ...]
     scenery: Scenery
+    engine: str  # of the world that is planned in
 
     @property
     def collisions(self) -> bool:
@@ -55,7 +56,7 @@ class Benchmark:
         """What a results file must agree on, to be gone on with."""
         return {
             "format": FORMAT,
-            **{name: getattr(self, name) for name in ("what", "robot", "seed")},
+            **{name: getattr(self, name) for name in ("what", "robot", "seed", "engine")},
             "scenery": dataclasses.asdict(self.scenery),
             "variants": [plain(dataclasses.asdict(variant)) for variant in self.variants],
             "versions": versions(),
@@ -142,6 +143,7 @@ def _run_task(benchmark: Benchmark, item: tuple[str, float, int]) -> dict[str, A
             seed=benchmark.seed,
             guess_sigma=variant.guess_sigma,
             collisions=benchmark.collisions,
+            engine=benchmark.engine,
         )
     return {"variant": name, **row}
 

@@ -19,9 +19,9 @@ from vrrt_jax.visual.problem import make_problem
 from vrrt_jax.visual.seeds import seeded_roots
 
 
-def run(repeats: int = 15, seeds: int = 3) -> dict:
+def run(repeats: int = 15, seeds: int = 3, engine: str = "mjx") -> dict:
     """The split of one iteration, and the outcome of every packaged problem for several seeds."""
-    problems = {name: load_problem(name) for name in problem_names()}
+    problems = {name: load_problem(name, engine=engine) for name in problem_names()}
     split = iteration_split(next(iter(problems.values())), repeats)
     outcomes = {name: _outcome(problem, seeds) for name, problem in problems.items()}
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

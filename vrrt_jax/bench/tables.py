@@ -144,6 +144,8 @@ def _command(results: dict[str, Any]) -> str:
     else:
         words += ["--method", results["variants"][0]["method"]]
     words += ["--config", "paper" if _is_paper(results) else "default"]
+    # Files from before there were engines are of the fast one.
+    words += ["--engine closed_form"] if results.get("engine") != "mjx" else []
     scenery = results["scenery"]
     words += ["--views 2"] if scenery["views"] == 2 else []
     words += ["--occluded"] if scenery["occluded"] else []

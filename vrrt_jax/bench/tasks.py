@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import zlib
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -64,11 +65,15 @@ def bench_robot(name: str) -> Robot:
 
 
 @functools.cache
-def bench_world(robot: str, name: str) -> World:
-    """A packaged world with the benchmark's number of slots, or an empty one."""
+def bench_world(robot: str, name: str, engine: str = "closed_form") -> World:
+    """A packaged world with the benchmark's number of slots, or an empty one.
+
+    Tasks are drawn in the world of the fast engine, so that they are the same for all engines.
+    """
+    settings: dict[str, Any] = {"engine": engine, "num_slots": NUM_SLOTS}
     if not name:
-        return build_world(bench_robot(robot), [], num_slots=NUM_SLOTS)
-    return load_world(name, bench_robot(robot), num_slots=NUM_SLOTS)
+        return build_world(bench_robot(robot), [], **settings)
+    return load_world(name, bench_robot(robot), **settings)
 
 
 def make_task(robot_name: str, level: float, index: int, seed: int, *, obstacles: bool) -> Task:

@@ -122,6 +122,10 @@ class TraceIgnored:
         """Carry a value."""
         self.value = value
 
+    def __repr__(self) -> str:
+        """The kind of what is carried."""
+        return f"TraceIgnored({type(self.value).__name__})"
+
     def __eq__(self, other: object) -> bool:
         """Equal to any other."""
         return isinstance(other, TraceIgnored)

@@ -1,54 +1,344 @@
-"""The same question put to MJX: the oracle of :mod:`vrrt_jax.scene.closed_form`.
+"""The default engine: MJX does kinematics and collision.
 
-This is the only file that touches MJX's internals. Every jit around it needs
-``compiler_options={"xla_cpu_use_fusion_emitters": False}`` on a CPU, or it runs thousands of times
-slower; that, the cost of its box and mesh pairs, and distances that are only a sign are why the
-planners do not use it.
+MJX's pairs of geoms are fixed when a model is compiled. So a model has room for some obstacles of
+each type; those not in use are parked far away, and a type that a scene lacks costs nothing.
+Only signs of MJX's distances are used: for boxes it gives no more than that.
 """
 
-from typing import Any
+import contextlib
+import dataclasses
+import functools
+import io
+from collections.abc import Sequence
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
+import numpy as np
 
+from vrrt_jax.core.check_protocols import overrides_is_free
+from vrrt_jax.core.types import TraceIgnoredNames, pytree, static
+from vrrt_jax.robots import mjcf_writer
+from vrrt_jax.robots.kinematics import link_poses, place
+from vrrt_jax.robots.self_collision import checked_pairs
+from vrrt_jax.scene.batch_last import Value, evaluate
+from vrrt_jax.scene.flat_program import FlatProgram, flat_program
+from vrrt_jax.scene.held import HeldObject
 from vrrt_jax.scene.obstacle_kinds import KINDS
-from vrrt_jax.scene.world import World, obstacle_list
+from vrrt_jax.scene.obstacles import PARKED, Obstacle, Obstacles, signed_distances, to_slots
+from vrrt_jax.scene.spheres import WorldSpheres, world_spheres
+from vrrt_jax.scene.world import World
+
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used, is absent
+    from mujoco import mjx
+
+_GEOM = mujoco.mjtGeom
+# Obstacles that MJX checks against spheres. Its routine for cylinders is an iterative search, and
+# its routine for convex meshes misses contacts near their rims: cylinders are measured instead, by
+# the closed formula of their slot at the positions that MJX gives the spheres.
+_PAIRED = (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX)
+# Room comes in multiples of this, so that scenes share their compiled functions. Boxes cost most.
+_ROOM_STEPS = (4, 4, 4, 2, 4)
+_BLOCK = 128  # configurations at a time: more do not fit into a CPU's cache
 
 
-def mjx_world(robot: Any, world: World) -> tuple[mjx.Model, mjx.Data]:
-    """Put a robot's collision spheres and a world's obstacles into MJX.
+@pytree
+class MjxObstacles:
+    """Obstacles as MJX has them; G geoms, in the order of their types, parked ones included."""
+
+    position: jax.Array  # (G, 3) [m]
+    quaternion: jax.Array  # (G, 4) wxyz
+    size: jax.Array  # (G, 3) as MuJoCo's geom size [m]
+    measured: Obstacles  # slots of those that MJX has no pair for
+
+
+@pytree
+class MjxWorld(World):
+    """A world whose questions are answered by MJX.
+
+    What the robot holds is measured instead: how near to which obstacle it may be is no property of
+    a geom, and another grip would be another model.
+    """
+
+    engine: ClassVar[str] = "mjx"
+
+    scene: "MjxScene" = static()
+    geoms: MjxObstacles
+    spheres: WorldSpheres
+
+    def is_free(self, q: jax.Array) -> jax.Array:
+        """See :func:`vrrt_jax.scene.world.is_free`."""
+        return self._answer(q)[0] & self._held_are_free(q)
+
+    def free_span(self, q: jax.Array, edge: jax.Array) -> jax.Array:
+        """See :class:`vrrt_jax.core.edges.Space`.
+
+        MJX says whether ``q`` is free. How much that says about the edge follows from distances,
+        which MJX does not have for boxes: they are measured where MJX puts the spheres.
+        """
+        if overrides_is_free(self):
+            return super().free_span(q, edge)
+        is_free, first, second = self._answer(q)
+        is_free &= self._held_are_free(q)
+        if self.spheres.num_held[0]:
+            poses = link_poses(self.chain, q)
+            first, second = (
+                place(s, poses) for s in (self.spheres.collision, self.spheres.self_collision)
+            )
+        span = self.spheres.free_span(self.obstacles, self.margin, (first, second), edge)
+        return jnp.where(is_free, jnp.maximum(span, 0.0), -1.0)
+
+    def obstacle_clearance(self, q: jax.Array) -> jax.Array:
+        """See :func:`vrrt_jax.scene.world.obstacle_clearance`; in closed form, as MJX has none."""
+        centers = place(self.spheres.collision, link_poses(self.chain, q))
+        return jnp.min(self.spheres.clearances(self.obstacles, centers))
+
+    def _held_are_free(self, q: jax.Array) -> jax.Array | bool:
+        """Whether what the robot holds touches nothing, () bool."""
+        poses = link_poses(self.chain, q)
+        return self.spheres.held_are_free(self.obstacles, self.margin, poses)
+
+    def _answer(self, q: jax.Array) -> tuple[jax.Array, ...]:
+        """Of :meth:`MjxScene.answer`."""
+        inputs = jax.lax.stop_gradient((self.geoms, self.margin, self.spheres.self_margin, q))
+        *others, q = inputs
+        return tuple(part[0] for part in self.scene.answers(others, q[None]))
+
+    def holding(self, attached: Sequence[HeldObject]) -> Self:
+        """See :meth:`vrrt_jax.scene.world.World.holding`."""
+        spheres = world_spheres(self.robot.value, self.obstacle_names, attached)
+        return dataclasses.replace(
+            self,
+            attached=TraceIgnoredNames(attached),
+            spheres=spheres.farther_apart(float(self.spheres.self_margin)),
+        )
+
+    def with_margin(self, margin: float) -> Self:
+        """See :func:`vrrt_jax.scene.world.with_margin`."""
+        return dataclasses.replace(
+            self,
+            margin=self.margin + margin,
+            spheres=self.spheres.farther_apart(margin),
+        )
+
+    def fields_of(self, obstacles: Sequence[Obstacle]) -> dict[str, Any]:
+        """See :meth:`vrrt_jax.scene.world.World.fields_of`; makes room where it is missing."""
+        needed = _room_for(obstacles)
+        room = tuple(max(old, new) for old, new in zip(self.scene.room, needed, strict=True))
+        fields = {"scene": mjx_scene(self.scene.xml, room), "geoms": _fill(obstacles, room)}
+        if self.attached:
+            fields["spheres"] = self.spheres.among(self.attached, [o.name for o in obstacles])
+        return fields
+
+
+def mjx_world(robot: Any, fields: dict[str, Any], obstacles: Sequence[Obstacle]) -> MjxWorld:
+    """A world with room for obstacles, and without any yet.
 
     Args:
         robot: from :func:`vrrt_jax.load_robot`.
-        world: the obstacles.
-
-    Returns:
-        The model, and data to start from.
+        fields: of :class:`vrrt_jax.scene.world.World`.
+        obstacles: to make room for.
     """
-    spec = mujoco.MjSpec.from_string(robot.xml)
-    for obstacle in obstacle_list(world):
-        geom = spec.worldbody.add_geom(
-            name=f"obstacle {obstacle.name}",
-            pos=obstacle.position,
-            quat=obstacle.quaternion,
-            contype=1,
-            conaffinity=0,
+    room = _room_for(obstacles)
+    return MjxWorld(
+        scene=mjx_scene(robot.xml, room),
+        geoms=_fill([], room),
+        spheres=world_spheres(robot, fields["obstacle_names"]),
+        **fields,
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MjxScene:
+    """A model with room for obstacles, and its compiled questions; from :func:`mjx_scene`.
+
+    Letters: ``g`` geoms of the model, of which the last are obstacles.
+    """
+
+    xml: str  # the robot
+    room: tuple[int, ...]  # for obstacles of each type of ``_PAIRED``, and for all others
+    model: mjx.Model
+    data: mjx.Data
+    is_collision_sphere: np.ndarray  # (g,) bool
+    is_self_collision_sphere: np.ndarray  # (g,) bool
+    contypes: tuple[np.ndarray, ...]  # (g,) each; under each, MJX checks pairs of one type alone
+
+    def answer(
+        self, geoms: MjxObstacles, margin: jax.Array, self_margin: jax.Array, q: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Whether one configuration (D,) is free, and where the spheres are.
+
+        Returns:
+            () bool; centers (3, n) of collision spheres and (3, m) of self-collision spheres [m].
+        """
+        # Pairs touch where they come nearer than the margin: spheres are inflated by it, and those
+        # that meet each other by half of it each.
+        radii = self.model.geom_size[:, 0]
+        radii += margin * self.is_collision_sphere + self_margin / 2 * self.is_self_collision_sphere
+        first = len(radii) - len(geoms.size)
+        model = self.model.replace(
+            geom_size=self.model.geom_size.at[:, 0].set(radii).at[first:].set(geoms.size),
+            geom_pos=self.model.geom_pos.at[first:].set(geoms.position),
+            geom_quat=self.model.geom_quat.at[first:].set(geoms.quaternion),
         )
-        kind = KINDS[obstacle.kind]
-        if kind.mjx_mesh is None:
-            geom.type, geom.size = kind.geom, kind.geom_size(obstacle.size)
-        else:
-            vertices = kind.mjx_mesh(obstacle.size)
-            mesh = spec.add_mesh(name=f"mesh of {obstacle.name}", uservert=vertices.ravel())
-            geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, mesh.name
-    model = mjx.put_model(spec.compile())
-    return model, mjx.make_data(model)
+        data = mjx.kinematics(model, self.data.replace(qpos=q))
+        free = jnp.bool_(True)
+        for contype in self.contypes:
+            contact = mjx.collision(model.replace(geom_contype=contype), data)._impl.contact  # type: ignore
+            free &= jnp.all(contact.dist > 0)
+        spheres = np.flatnonzero(self.is_collision_sphere)
+        centers = data.geom_xpos[spheres].T
+        if self.room[-1]:
+            distances = signed_distances(geoms.measured, centers)
+            free &= jnp.all(distances > radii[spheres, None])
+        return free, centers, data.geom_xpos[np.flatnonzero(self.is_self_collision_sphere)].T
+
+    @functools.cached_property
+    def program(self) -> FlatProgram:
+        """:meth:`answer` as equations."""
+        shape = jax.ShapeDtypeStruct
+        inputs = (_fill([], self.room), shape((), np.float32), shape((), np.float32))
+        return flat_program(self.answer, *inputs, shape((self.model.nq,), np.float32))
+
+    @functools.cached_property
+    def answers(self) -> Any:
+        """:meth:`answer` of configurations (n, D), as ``(inputs before q, q)``.
+
+        Under any number of ``vmap``, configurations become one batch.
+        """
+
+        @jax.custom_batching.custom_vmap
+        def answers(others: Any, q: jax.Array) -> tuple[jax.Array, ...]:
+            return _answers(self, others, q)
+
+        @answers.def_vmap
+        def batch(size: int, is_batched: Any, others: Any, q: jax.Array) -> Any:
+            outputs = (True,) * len(self.program.outputs)
+            if any(jax.tree.leaves(is_batched[0])):  # several worlds, one after another
+
+                def one(index: jax.Array) -> tuple[jax.Array, ...]:
+                    row = jax.tree.map(
+                        lambda leaf, batched: leaf[index] if batched else leaf,
+                        [others, q],
+                        is_batched,
+                    )
+                    return answers(*row)
+
+                return jax.lax.map(one, jnp.arange(size)), outputs
+            flat = answers(others, q.reshape(size * q.shape[1], q.shape[2]))
+            return tuple(part.reshape(size, q.shape[1], *part.shape[1:]) for part in flat), outputs
+
+        return answers
 
 
-def mjx_is_free(model: mjx.Model, data: mjx.Data, q: jax.Array) -> jax.Array:
-    """Whether ``q`` (D,) is free of contacts, () bool."""
-    data = mjx.kinematics(model, data.replace(qpos=q))
-    contact = mjx.collision(model, data)._impl.contact
-    return jnp.all(contact.dist > 0)
+@functools.partial(jax.jit, static_argnums=0)
+def _answers(scene: MjxScene, others: Any, q: jax.Array) -> tuple[jax.Array, ...]:
+    """:meth:`MjxScene.answer` of configurations (n, D); what is not used costs nothing."""
+    constants = [Value(leaf, False) for leaf in jax.tree.leaves(others)]
+
+    def block(q: jax.Array) -> tuple[jax.Array, ...]:
+        inputs = [*constants, Value(q.T, True)]
+        found = evaluate(scene.program, inputs, len(q), seed=q[0, 0])
+        shapes = [variable.aval.shape for variable in scene.program.outputs]
+        return tuple(
+            jnp.moveaxis(
+                jnp.broadcast_to(
+                    part.array if part.is_batched else jnp.asarray(part.array)[..., None],
+                    (*shape, len(q)),
+                ),
+                -1,
+                0,
+            )
+            for part, shape in zip(found, shapes, strict=True)
+        )
+
+    # Blocks of equal size; the last is filled up with zeros.
+    num_blocks = max(-(-len(q) // _BLOCK), 1) if jax.default_backend() == "cpu" else 1
+    if num_blocks == 1:
+        size = max(len(q), 1)
+        return tuple(part[: len(q)] for part in block(jnp.pad(q, ((0, size - len(q)), (0, 0)))))
+    size = -(-len(q) // num_blocks)
+    padded = jnp.pad(q, ((0, num_blocks * size - len(q)), (0, 0)))
+    parts = jax.lax.map(block, padded.reshape(num_blocks, size, -1))
+    return tuple(part.reshape(-1, *part.shape[2:])[: len(q)] for part in parts)
+
+
+@functools.lru_cache(maxsize=64)
+def mjx_scene(xml: str, room: tuple[int, ...]) -> MjxScene:
+    """The scene of a robot with room for obstacles; worlds of as much room share it.
+
+    Args:
+        xml: the robot, see :func:`vrrt_jax.robots.mjcf_writer.collision_mjcf`.
+        room: for obstacles of each type of ``_PAIRED``, and for all others.
+    """
+    spec = mujoco.MjSpec.from_string(xml)
+    # A body of their own: what the robot's file excludes from contact with the world's body, its
+    # base, says nothing of obstacles.
+    body = spec.worldbody.add_body()
+    for geom, count in zip(_PAIRED, room, strict=False):
+        for _ in range(count):
+            body.add_geom(type=geom, size=(1.0, 1.0, 1.0), contype=1, conaffinity=0)
+    model = spec.compile()
+    robot_geoms = np.arange(model.ngeom) < model.ngeom - sum(room[:-1])
+    is_of_robot = {
+        kind["group"]: robot_geoms & (model.geom_group == int(kind["group"]))
+        for kind in (mjcf_writer.COLLISION_GEOM, mjcf_writer.SELF_COLLISION_GEOM)
+    }
+    is_collision_sphere, is_self_collision_sphere = is_of_robot.values()
+    contypes = [
+        np.where(~robot_geoms & (model.geom_type == geom), 1, 0).astype(np.int32)
+        for geom, count in zip(_PAIRED, room, strict=False)
+        if count and is_collision_sphere.any()
+    ]
+    if len(checked_pairs(model, np.flatnonzero(is_self_collision_sphere))):
+        contypes.append(np.where(is_self_collision_sphere, model.geom_contype, 0).astype(np.int32))
+    with jax.ensure_compile_time_eval():  # it may be asked for inside a user's jit
+        on_device = mjx.put_model(model)
+        return MjxScene(
+            xml=xml,
+            room=room,
+            model=on_device,
+            data=mjx.make_data(on_device),
+            is_collision_sphere=is_collision_sphere,
+            is_self_collision_sphere=is_self_collision_sphere,
+            contypes=tuple(contypes),
+        )
+
+
+def _by_type(obstacles: Sequence[Obstacle]) -> list[list[Obstacle]]:
+    """The obstacles of each type of ``_PAIRED``, and all others."""
+    groups = {geom: [] for geom in _PAIRED}
+    others: list[Obstacle] = []
+    for obstacle in obstacles:
+        groups.get(KINDS[obstacle.kind].geom, others).append(obstacle)
+    return [*groups.values(), others]
+
+
+def _room_for(obstacles: Sequence[Obstacle]) -> tuple[int, ...]:
+    groups = zip(_by_type(obstacles), _ROOM_STEPS, strict=True)
+    return tuple(step * -(-len(group) // step) for group, step in groups)
+
+
+def _fill(obstacles: Sequence[Obstacle], room: tuple[int, ...]) -> MjxObstacles:
+    """Obstacles in their places, and the rest parked."""
+    *paired, others = _by_type(obstacles)
+    rows = []
+    for geom, group, count in zip(_PAIRED, paired, room, strict=False):
+        for obstacle in group:
+            size = KINDS[obstacle.kind].geom_size(obstacle.size)
+            rows.append((*obstacle.position, *obstacle.quaternion, *size))
+        # A plane that is parked is far below.
+        away = -PARKED if geom == _GEOM.mjGEOM_PLANE else PARKED
+        rows += [(away, away, away, 1, 0, 0, 0, 0.01, 0.01, 0.01)] * (count - len(group))
+    table = np.array(rows, np.float64).reshape(-1, 10)
+    table[:, 3:7] /= np.linalg.norm(table[:, 3:7], axis=1, keepdims=True)
+    position, quaternion, size = (
+        jnp.asarray(part, jnp.float32) for part in np.split(table, (3, 7), axis=1)
+    )
+    return MjxObstacles(
+        position=position,
+        quaternion=quaternion,
+        size=size,
+        measured=to_slots(others, room[-1]),
+    )

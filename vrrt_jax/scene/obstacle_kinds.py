@@ -9,10 +9,8 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
 import mujoco
-import numpy as np
 
 HALF_SPACE = 50.0  # [m] half the edge of the box that stands for a plane
-PRISM_SIDES = 16  # of the convex mesh that stands for a cylinder where an engine lacks cylinders
 
 Size = Sequence[float]  # (3,) as MuJoCo's geom size [m]
 
@@ -36,18 +34,6 @@ class ObstacleKind:
     decode: Callable[[SlotShape], Size]  # shape of the slot -> size
     shift: float = 0.0  # from its position to the center of its slot, along its z axis [m]
     geom_size: Callable[[Size], Size] = tuple  # size -> the size that MuJoCo compiles
-    # size -> vertices (n, 3) of the convex mesh that stands for it in MJX, which has no pairs of
-    # spheres and this kind; None where MJX has them.
-    mjx_mesh: Callable[[Size], np.ndarray] | None = None
-
-
-def _prism(size: Size) -> np.ndarray:
-    """Vertices (2 * sides, 3) of a prism around a cylinder."""
-    radius, half = size[:2]
-    angle = 2 * np.pi * np.arange(PRISM_SIDES) / PRISM_SIDES
-    # The sides touch the cylinder, so that the corners lie outside of it.
-    ring = radius / np.cos(np.pi / PRISM_SIDES) * np.stack([np.cos(angle), np.sin(angle)], 1)
-    return np.concatenate([np.column_stack([ring, np.full(PRISM_SIDES, z)]) for z in (-half, half)])
 
 
 KINDS: Mapping[str, ObstacleKind] = {
@@ -74,7 +60,6 @@ KINDS: Mapping[str, ObstacleKind] = {
         num_sizes=2,
         encode=lambda size: SlotShape(half=(size[0], size[0], size[1]), is_round=True),
         decode=lambda shape: (shape.half[0], shape.half[2], 0.0),
-        mjx_mesh=_prism,
     ),
     "plane": ObstacleKind(  # its size is of no interest: it has no end
         geom=mujoco.mjtGeom.mjGEOM_PLANE,

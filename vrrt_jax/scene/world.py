@@ -1,13 +1,13 @@
 """A robot among obstacles, and the question every planner asks: is this configuration free?
 
 Here is the interface, :class:`World`. An engine is a subclass that answers it:
-:mod:`vrrt_jax.scene.closed_form` is the one that :func:`build_world` chooses. Obstacles live in
-slots, so that moving, adding or removing them never re-compiles.
+:mod:`vrrt_jax.scene.mjx`, the default, and :mod:`vrrt_jax.scene.closed_form`, the fast one.
+Obstacles live in slots, so that moving, adding or removing them does not re-compile.
 """
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -17,12 +17,20 @@ from vrrt_jax.core.edges import StraightLineEdges
 from vrrt_jax.core.types import PytreeSubclasses, TraceIgnored, TraceIgnoredNames, pytree, static
 from vrrt_jax.robots.kinematics import Chain
 from vrrt_jax.scene.held import HeldObject
-from vrrt_jax.scene.obstacles import Obstacle, Obstacles, floats, from_slots, to_slots
+from vrrt_jax.scene.obstacles import (
+    Obstacle,
+    Obstacles,
+    check_obstacle,
+    floats,
+    from_slots,
+    to_slots,
+)
 
 _NO_ENGINE = (
-    "World is an interface without an engine: subclass the world of an engine, such as "
-    "vrrt_jax.scene.closed_form.ClosedFormWorld"
+    "World is an interface without an engine: subclass the world of an engine, vrrt_jax.MjxWorld "
+    "or vrrt_jax.ClosedFormWorld"
 )
+ENGINES = ("mjx", "closed_form")
 
 
 _MARGIN_SHARES = (1.0, 0.5, 0.25, 0.1)  # of the margin that is wanted, the largest that fits
@@ -38,6 +46,8 @@ class World(PytreeSubclasses, StraightLineEdges):
 
     Letters: ``D`` joints, ``K`` obstacle slots.
     """
+
+    engine: ClassVar[str] = ""  # which of ENGINES answers
 
     chain: Chain
     obstacles: Obstacles
@@ -68,13 +78,13 @@ class World(PytreeSubclasses, StraightLineEdges):
         """
         raise NotImplementedError(_NO_ENGINE)
 
-    def fields_of(self, names: Sequence[str]) -> dict[str, Any]:
-        """Fields of the engine that change with the obstacles: those of these names, in slots."""
-        return {}
-
     def with_margin(self, margin: float) -> Self:
         """See :func:`with_margin`."""
         return dataclasses.replace(self, margin=self.margin + margin)
+
+    def fields_of(self, obstacles: Sequence[Obstacle]) -> dict[str, Any]:
+        """Fields of the engine's own that change with the obstacles, on the host."""
+        return {}
 
 
 def is_free(world: World, q: jax.Array) -> jax.Array:
@@ -103,6 +113,7 @@ def build_world(
     robot: Any,
     obstacles: Sequence[Obstacle] = (),
     *,
+    engine: str = "mjx",
     num_slots: int = 16,
     margin: float = 0.0,
     resolution: float = 0.02,
@@ -112,14 +123,21 @@ def build_world(
     Args:
         robot: from :func:`vrrt_jax.load_robot`.
         obstacles: what stands around it.
+        engine: who answers what is free: "mjx", or "closed_form", which
+            compiles sooner and is faster among many boxes.
         num_slots: room for obstacles; raised to the next multiple of 8 that holds them all. Worlds
             of one robot with as many slots share their compiled functions.
         margin: clearance asked of obstacles [m].
         resolution: longest step between two collision checks on an edge [rad].
 
     Raises:
-        ValueError: an obstacle of an unsupported kind, or a number out of range.
+        ValueError: an engine that does not exist, an obstacle of an unsupported kind, or a number
+            out of range.
     """
+    if engine not in ENGINES:
+        raise ValueError(f"unknown engine '{engine}'; have: {', '.join(ENGINES)}")
+    for obstacle in obstacles:
+        check_obstacle(obstacle)
     if not (np.isfinite(margin) and margin >= 0 and np.isfinite(resolution) and resolution > 0):
         raise ValueError(
             f"margin={margin} and resolution={resolution}: expected margin >= 0 m and "
@@ -127,6 +145,7 @@ def build_world(
         )
     # Engines build on this module, so that it cannot import them at its top.
     from vrrt_jax.scene.closed_form import closed_form_world
+    from vrrt_jax.scene.mjx import mjx_world
 
     # Slots in multiples of eight: worlds of about the same size share their compiled functions.
     num_slots = 8 * max(-(-num_slots // 8), -(-len(obstacles) // 8), 1)
@@ -144,12 +163,16 @@ def build_world(
         "colors": TraceIgnoredNames([()] * num_slots),
         "robot": TraceIgnored(robot),
     }
-    world = closed_form_world(robot, fields)
-    return with_obstacles(world, obstacles)
+    if engine == "mjx":
+        return with_obstacles(mjx_world(robot, fields, obstacles), obstacles)
+    return with_obstacles(closed_form_world(robot, fields), obstacles)
 
 
 def with_obstacles(world: World, obstacles: Sequence[Obstacle]) -> World:
-    """The same robot among other obstacles; nothing re-compiles.
+    """The same robot among other obstacles.
+
+    Nothing re-compiles, but where the engine is "mjx" and there are more obstacles of a kind than
+    there is room for: room comes in fours, for boxes in twos.
 
     Raises:
         ValueError: more obstacles than slots, a name used twice, an unsupported kind or a size that
@@ -172,8 +195,8 @@ def with_obstacles(world: World, obstacles: Sequence[Obstacle]) -> World:
     spare = num_slots - len(obstacles)
     return dataclasses.replace(
         world,
-        obstacles=to_slots(obstacles, num_slots),
-        **world.fields_of(names),
+        obstacles=to_slots(obstacles, num_slots),  # checks them
+        **world.fields_of(obstacles),
         obstacle_names=TraceIgnoredNames(names + [""] * spare),
         kinds=TraceIgnoredNames([o.kind for o in obstacles] + [""] * spare),
         colors=TraceIgnoredNames([o.rgba for o in obstacles] + [()] * spare),

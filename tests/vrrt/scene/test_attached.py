@@ -30,6 +30,11 @@ def thing(kind="box", position=AHEAD, **fields):
     return vrrt_jax.Obstacle(kind=kind, position=tuple(map(float, position)), **fields)
 
 
+def bare_world(panda, obstacles=(), engine="closed_form"):
+    """Mostly of the engine that compiles sooner; held objects are measured alike in both."""
+    return vrrt_jax.build_world(panda, obstacles, engine=engine)
+
+
 def free(world, q):
     return bool(batch_is_free(world, jnp.asarray(q, jnp.float32)[None])[0])
 
@@ -37,7 +42,7 @@ def free(world, q):
 @pytest.fixture(scope="module")
 def around(panda):
     """Obstacles of several kinds, near enough to be touched often."""
-    return vrrt_jax.build_world(
+    return bare_world(
         panda,
         [
             thing("box", (0.5, 0.0, 0.2), name="table", size=(0.3, 0.4, 0.02)),
@@ -53,7 +58,7 @@ def on_table(panda):
     x, y, z = fingertips(panda, START)
     half = SHAPES["cylinder"][1]
     table = thing("box", (x, y, z - half - 0.02 + 0.003), name="table", size=(0.3, 0.3, 0.02))
-    return vrrt_jax.build_world(panda, [thing("cylinder", (x, y, z)), table])
+    return bare_world(panda, [thing("cylinder", (x, y, z)), table])
 
 
 @pytest.mark.parametrize("kind", SHAPES)
@@ -102,7 +107,7 @@ def test_the_object_moves_with_the_hand(panda, around):
 
 
 def test_the_hand_may_touch_it_and_other_links_may_not(panda):
-    empty = vrrt_jax.build_world(panda, [])
+    empty = bare_world(panda)
     inside = vrrt_jax.attach(empty, thing("box", (0, 0, 0.05)), "hand")  # in the palm and fingers
     assert free(inside, START)
     for geometry in ("spheres", "meshes"):
@@ -126,7 +131,7 @@ def _hand_pose(panda, q):
 
 
 def test_two_held_objects_are_checked_against_each_other(panda):
-    empty = vrrt_jax.build_world(panda, [])
+    empty = bare_world(panda)
     x, y, z = fingertips(panda, START)
     world = vrrt_jax.attach(empty, thing("sphere", (x, y, z)), "hand", q=START)
     apart = vrrt_jax.attach(world, thing("sphere", (x, y, z - 0.3), name="egg"), "link4", q=START)
@@ -186,7 +191,7 @@ def test_an_object_deep_in_something_is_named(panda, on_table):
 def test_spheres_that_stick_out_are_named(panda):
     x, y, z = fingertips(panda, START)
     sheet = thing("box", (x, y, z - 0.06 - 0.014), name="sheet", size=(0.3, 0.3, 0.01))
-    world = vrrt_jax.build_world(panda, [sheet])
+    world = bare_world(panda, [sheet])
     can = dataclasses.replace(thing("cylinder"), position=_in_hand(panda, (x, y, z)))
     world = vrrt_jax.attach(world, can, "hand")  # without q: no support is known
     with pytest.raises(ValueError, match="the spheres around can, which stick out of it by 10 mm"):
@@ -207,7 +212,7 @@ WALL = thing("box", (0.573, 0.436, 0.35), name="wall", size=(0.02, 0.02, 0.35))
 def test_a_path_that_drags_the_object_through_a_wall_is_refused(panda):
     """The bare arm passes beside the wall; the stick does not, and is carried around."""
     stick = thing("capsule", size=STICK, quaternion=(0.7071, 0.7071, 0, 0), name="stick")
-    world = vrrt_jax.build_world(panda, [WALL])
+    world = bare_world(panda, [WALL])
     goal = START + np.array([1.3, 0, 0, 0, 0, 0, 0])
     path = np.stack([START, goal])
     assert verify_path(panda, world, path).ok
@@ -230,6 +235,31 @@ def test_obstacles_move_while_it_is_held(panda, on_table):
         assert jax.tree.structure(moved) == jax.tree.structure(world)
 
 
+def test_both_engines_agree_on_held_objects(panda, around, on_table, rng):
+    """On configurations, on spans of edges, with a margin, and after obstacles have moved."""
+    uniform = rng.uniform(panda.lower, panda.upper, (300, 7)).astype(np.float32)
+    near = (START + rng.normal(size=(300, 7)) * 0.1).astype(np.float32)
+    edge = jnp.asarray(rng.normal(size=7), jnp.float32)
+    spans = jax.jit(jax.vmap(lambda world, q: world.free_span(q, edge), (None, 0)))
+    for world, body, q in ((around, "link7", uniform), (on_table, "hand", near)):
+        obstacles = [o for o in vrrt_jax.obstacle_list(world) if o.name != "can"]
+        q = jnp.asarray(q)
+        answers = []
+        for engine in ("closed_form", "mjx"):
+            own = bare_world(panda, vrrt_jax.obstacle_list(world), engine)
+            grip = ("can", body) if world is on_table else (thing(), body)
+            own = vrrt_jax.attach(own, *grip, q=START if world is on_table else None)
+            moved = vrrt_jax.with_obstacles(own, obstacles[::-1])
+            answers.append(
+                [batch_is_free(w, q) for w in (own, with_margin(own, 0.01), moved)]
+                + [spans(own, q)]
+            )
+        for ours, theirs in zip(*answers, strict=True):
+            differs = ~np.isclose(ours, theirs, atol=1e-3)
+            assert differs.mean() < 0.01
+        assert 0.05 < np.mean(answers[0][0]) < 0.95
+
+
 class NeverLeft(vrrt_jax.ClosedFormWorld):
     """A rule of one's own."""
 
@@ -249,20 +279,18 @@ def test_a_subclass_keeps_what_is_held(panda, around):
     for held in (vrrt_jax.with_obstacles(mine, block), vrrt_jax.with_obstacles(world, block)):
         assert not free(held, START) and "can touches block" in contacts(panda, held, START)
     later = vrrt_jax.attach(NeverLeft(**vars(around), limit=jnp.float32(0.5)), thing("box"), "hand")
-    assert isinstance(later, NeverLeft) and len(later.collision_radius) > len(
-        around.collision_radius
-    )
+    assert isinstance(later, NeverLeft) and len(later.spheres.radius) > len(around.spheres.radius)
 
 
 def test_the_margin_is_asked_of_held_objects_too(panda):
-    empty = vrrt_jax.build_world(panda, [])
+    empty = bare_world(panda)
     for world in (
         with_margin(vrrt_jax.attach(empty, thing("box"), "hand"), 0.03),
         vrrt_jax.attach(with_margin(empty, 0.03), thing("box"), "hand"),
     ):
         bare = vrrt_jax.attach(empty, thing("box"), "hand")
-        pairs = np.asarray(bare.contact_distance) > 0
-        wider = np.asarray(world.contact_distance - bare.contact_distance)
+        pairs = np.asarray(bare.spheres.contact_distance) > 0
+        wider = np.asarray(world.spheres.contact_distance - bare.spheres.contact_distance)
         np.testing.assert_allclose(wider, 0.03 * pairs, atol=1e-6)
 
 

@@ -11,7 +11,6 @@ from vrrt_jax.core.check_protocols import overrides_is_free
 from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import batch_link_poses, link_poses
 from vrrt_jax.scene.closed_form import ClosedFormWorld
-from vrrt_jax.scene.mjx import mjx_is_free, mjx_world
 from vrrt_jax.scene.obstacles import load_obstacles, signed_distances
 from vrrt_jax.scene.world import World, batch_is_free, with_margin
 
@@ -70,24 +69,10 @@ def test_distance_outside_equals_mujoco(kind, panda, rng):
     assert np.all(ours[:, 3:] > 100), "empty slots are far away"
 
 
-def test_is_free_agrees_with_mjx(panda, wall_world, free, rng):
-    q = rng.uniform(panda.lower, panda.upper, (256, 7)).astype(np.float32)
-    # MJX sees cylinders as prisms around them: compare on a world without any.
-    obstacles = [o for o in vrrt_jax.obstacle_list(wall_world) if o.kind != "cylinder"]
-    world = vrrt_jax.with_obstacles(wall_world, obstacles)
-    model, data = mjx_world(panda, world)
-    oracle = jax.jit(
-        jax.vmap(lambda q: mjx_is_free(model, data, q)),
-        compiler_options={"xla_cpu_use_fusion_emitters": False},
-    )
-    ours, theirs = np.asarray(free(world, q)), np.asarray(oracle(q))
-    assert 0.1 < theirs.mean() < 0.9
-    np.testing.assert_array_equal(ours, theirs)
-
-
 def test_margin_makes_it_stricter(panda, wall_world, free, rng):
     q = rng.uniform(panda.lower, panda.upper, (256, 7)).astype(np.float32)
-    wide = vrrt_jax.build_world(panda, vrrt_jax.obstacle_list(wall_world), margin=0.05)
+    obstacles = vrrt_jax.obstacle_list(wall_world)
+    wide = vrrt_jax.build_world(panda, obstacles, engine="closed_form", margin=0.05)
     tight_free, wide_free = np.asarray(free(wall_world, q)), np.asarray(free(wide, q))
     assert np.all(tight_free | ~wide_free)
     assert tight_free.sum() > wide_free.sum()
@@ -113,7 +98,8 @@ def test_obstacles_move_without_retracing(panda, wall_world, rng):
 
 def test_more_margin_only_forbids_more_of_obstacles_and_itself(panda, wall_world, free, rng):
     q = rng.uniform(panda.lower, panda.upper, (2000, 7)).astype(np.float32)
-    for world in (wall_world, vrrt_jax.build_world(panda)):  # the empty one: itself alone
+    empty = vrrt_jax.build_world(panda, engine="closed_form")  # itself alone
+    for world in (wall_world, empty):
         now, wary = free(world, q), free(with_margin(world, 0.03), q)
         assert not np.any(wary & ~now)
         assert 0 < np.sum(wary) < np.sum(now)

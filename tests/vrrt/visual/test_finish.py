@@ -77,7 +77,7 @@ def beside(y):
 
 @pytest.mark.parametrize("margin, granted", [(0.0, True), (0.001, False)])
 def test_a_straight_way_that_only_the_spheres_refuse(slider, margin, granted):
-    world = vrrt_jax.build_world(slider, [beside(0.1525)], margin=margin)
+    world = vrrt_jax.build_world(slider, [beside(0.1525)], engine="closed_form", margin=margin)
     ends = np.array([[-0.5], [0.5]], np.float32)
     edge = world.edge(jnp.asarray(ends[:1]), jnp.asarray(ends[1:]))
     steps = int(free_prefix(world, jnp.asarray(ends[:1]), edge, 64)[0])
@@ -97,7 +97,7 @@ class NoPassage(vrrt_jax.ClosedFormWorld):
 
 
 def test_a_straight_path_obeys_an_is_free_of_ones_own(slider):
-    world = vrrt_jax.build_world(slider, [])
+    world = vrrt_jax.build_world(slider, [], engine="closed_form")
     ends = np.array([[-0.5], [0.5]], np.float32)
     found = finished(trees.create(jnp.asarray(ends), jnp.zeros(2), None, 8))
     assert finish._straight(slider, world, found, *ends)[1] is not None
@@ -110,7 +110,7 @@ def test_a_straight_path_obeys_an_is_free_of_ones_own(slider):
 
 def test_a_match_without_a_way_is_told(slider, monkeypatch):
     """What can be reached but does not match is no substitute for it."""
-    world = vrrt_jax.build_world(slider, [beside(0.1)])
+    world = vrrt_jax.build_world(slider, [beside(0.1)], engine="closed_form")
     q = np.array([[-0.4], [0.5]], np.float32)
     losses = np.array([2.0, 0.5])
     polished = Polished(q=q, loss=losses, cost=losses)

@@ -1,0 +1,176 @@
+"""The spheres of a robot among obstacles: distances, and how far they vouch for an edge."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax.core.types import pytree, static
+from vrrt_jax.robots.kinematics import Spheres, lever_arms, place, placement
+from vrrt_jax.scene.held import HeldObject, HeldSpheres, gripped_distances, together
+from vrrt_jax.scene.obstacles import Obstacles, signed_distances
+
+_ROUNDING = 0.999  # of spans: what single precision may round
+
+
+@pytree
+class WorldSpheres:
+    """Spheres of a robot as worlds use them; those of what it holds are the last of both sets.
+
+    Letters: ``n`` collision spheres, ``m`` self-collision spheres.
+    """
+
+    collision: jax.Array  # (L * 12, 3 n) their placement, see ``kinematics.placement``
+    radius: jax.Array  # (n,) of these [m]
+    # Spheres of a held object may always be as near to obstacles as where it was gripped.
+    gripped_distance: jax.Array  # (n, K) of their centers there, infinite for all others [m]
+    self_collision: jax.Array  # (L * 12, 3 m) placement of the others
+    contact_distance: jax.Array  # (m, m) at which two of them touch, 0 for unchecked pairs [m]
+    # How far a collision sphere moves, and how much the distance of two self-collision spheres
+    # changes, at most while one joint moves by one, see ``kinematics.lever_arms``.
+    lever_arms: jax.Array  # (D, n) [m/rad] or [m/m]
+    relative_lever_arms: jax.Array  # (D, m, m) the same units
+    self_margin: jax.Array  # () what is in the contact distances beside radii [m]
+    num_held: tuple[int, int] = static(default=(0, 0))  # how many of n, and of m
+
+    def clearances(
+        self, obstacles: Obstacles, centers: jax.Array, margin: jax.Array | float = 0.0
+    ) -> jax.Array:
+        """Distances (n,) of collision spheres at (3, n), larger by a margin, to obstacles [m]."""
+        needed = jnp.minimum(self.radius[:, None] + margin, self.gripped_distance)
+        return jnp.min(signed_distances(obstacles, centers) - needed, axis=1)
+
+    def squared_gaps(self, centers: jax.Array) -> jax.Array:
+        """Squared distances less squared contact distances (m, m) [m^2] of spheres at (3, m)."""
+        return _squared_distances(centers) - self.contact_distance**2
+
+    def free_span(
+        self,
+        obstacles: Obstacles,
+        margin: jax.Array,
+        centers: tuple[jax.Array, jax.Array],
+        edge: jax.Array,
+    ) -> jax.Array:
+        """How much of an edge is free for certain: distances divided by the spheres' speeds.
+
+        Args:
+            obstacles: K slots.
+            margin: () asked of them [m].
+            centers: (3, n) of collision spheres and (3, m) of self-collision spheres.
+            edge: (D,) the straight way that the joints go.
+
+        Returns:
+            () the share of the edge that is free before and after; negative if something touches.
+        """
+        clearance = self.clearances(obstacles, centers[0], margin)
+        # Pairs that are not checked are infinitely far apart.
+        apart = jnp.sqrt(_squared_distances(centers[1]) + 1e-12)
+        gap = jnp.where(self.contact_distance > 0, apart - self.contact_distance, jnp.inf)
+        speed, relative_speed = (
+            jnp.tensordot(jnp.abs(edge), arms, 1) + 1e-9
+            for arms in (self.lever_arms, self.relative_lever_arms)
+        )
+        span = jnp.minimum(
+            jnp.min(clearance / speed), jnp.min(gap / relative_speed, initial=jnp.inf)
+        )
+        is_free = (jnp.min(clearance) > 0) & (jnp.min(gap, initial=jnp.inf) >= 0)
+        return jnp.where(is_free, _ROUNDING * span, -1.0)
+
+    def farther_apart(self, margin: float) -> "WorldSpheres":
+        """The same spheres, which touch each other while ``margin`` [m] is still between them."""
+        # A contact distance of zero marks a pair that is not checked, and must stay zero.
+        wider = jnp.where(self.contact_distance > 0, self.contact_distance + margin, 0.0)
+        self_margin = self.self_margin + margin
+        return dataclasses.replace(self, contact_distance=wider, self_margin=self_margin)
+
+    def among(self, attached: Sequence[HeldObject], names: Sequence[str]) -> "WorldSpheres":
+        """The same spheres, of which some are of held objects, among obstacles of these names."""
+        num_slots = self.gripped_distance.shape[1]
+        held = gripped_distances(attached, [*names, *[""] * (num_slots - len(names))])
+        distance = np.full(self.gripped_distance.shape, np.inf, np.float32)
+        distance[len(distance) - len(held) :] = held
+        return dataclasses.replace(self, gripped_distance=jnp.asarray(distance))
+
+    def held_are_free(
+        self, obstacles: Obstacles, margin: jax.Array, poses: jax.Array
+    ) -> jax.Array | bool:
+        """Whether all that the robot holds touches nothing, () bool, at link poses (L, 4, 4)."""
+        if self.num_held == (0, 0):
+            return True
+        first, second = (-count for count in self.num_held)
+        clearance = self.clearances(obstacles, place(self.collision, poses), margin)
+        gap = self.squared_gaps(place(self.self_collision, poses))
+        return (jnp.min(clearance[first:]) > 0) & (jnp.min(gap[:, second:]) >= 0)
+
+
+def world_spheres(
+    robot: Any, names: Sequence[str], attached: Sequence[HeldObject] = ()
+) -> WorldSpheres:
+    """The spheres of a robot and of what it holds.
+
+    Args:
+        robot: from :func:`vrrt_jax.load_robot`.
+        names: (K,) of the obstacles in their slots, '' where they are empty.
+        attached: what the robot holds.
+    """
+    # A held object is checked against all other links, and against what these hold.
+    first, second = np.asarray(robot.self_collision_pairs, int).reshape(-1, 2).T
+    held = together(attached, with_corners=False)
+    alone = [_without_others(robot)] if attached else []
+    link, center, radius = _joined(robot.self_collision_spheres, *alone, held)
+    contact_distance = np.zeros((len(radius), len(radius)), np.float32)
+    contact_distance[first, second] = radius[first] + radius[second]
+    num_own = len(radius) - len(held.radius)
+    is_other = np.triu(link[:, None] != link[num_own:], 1 - num_own)
+    contact_distance[:, num_own:] = is_other * (radius[:, None] + radius[num_own:])
+    # Joints that carry both spheres of a pair leave their distance as it is.
+    own = lever_arms(robot.chain, link, center, robot.lower, robot.upper)
+    first_arm, second_arm = own[:, :, None], own[:, None]
+    is_between = (first_arm > 0) != (second_arm > 0)
+    outer = together(attached, with_corners=True)
+    collision = _joined(robot.collision_spheres, outer)
+    spheres = WorldSpheres(
+        collision=jnp.asarray(placement(*collision[:2], robot.chain.num_links)),
+        radius=jnp.asarray(collision[2]),
+        gripped_distance=jnp.full((len(collision[2]), len(names)), jnp.inf),
+        self_collision=jnp.asarray(placement(link, center, robot.chain.num_links)),
+        contact_distance=jnp.asarray(contact_distance),
+        lever_arms=jnp.asarray(
+            lever_arms(robot.chain, *collision[:2], robot.lower, robot.upper), jnp.float32
+        ),
+        relative_lever_arms=jnp.asarray(
+            np.where(is_between, first_arm + second_arm, 0.0), jnp.float32
+        ),
+        self_margin=jnp.float32(0.0),
+        num_held=(len(outer.radius), len(held.radius)),
+    )
+    return spheres.among(attached, names) if attached else spheres
+
+
+def _without_others(robot: Any) -> HeldSpheres:
+    """Collision spheres of links that have no self-collision spheres.
+
+    These links touch no other ones, but what is held may touch them.
+    """
+    spheres = robot.collision_spheres
+    link, center, radius = (np.asarray(x) for x in (spheres.link, spheres.center, spheres.radius))
+    is_alone = ~np.isin(link, np.asarray(robot.self_collision_spheres.link))
+    return HeldSpheres(link=link[is_alone], center=center[is_alone], radius=radius[is_alone])
+
+
+def _joined(*parts: Spheres | HeldSpheres) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Links (n,), centers (n, 3) and radii (n,) of several sets of spheres, in single precision."""
+    return (
+        np.concatenate([np.asarray(part.link) for part in parts]),
+        np.concatenate([np.asarray(part.center, np.float32) for part in parts]),
+        np.concatenate([np.asarray(part.radius, np.float32) for part in parts]),
+    )
+
+
+def _squared_distances(centers: jax.Array) -> jax.Array:
+    """Between all pairs (m, m) of points (3, m)."""
+    x, y, z = ((axis[:, None] - axis[None]) ** 2 for axis in centers)
+    return x + y + z
