@@ -63,7 +63,7 @@ def _mesh_renderer(robot: Robot, world: World) -> Any:
         spec = mesh_spec(robot)
         if spec is None:
             return None
-        renderer = MeshRenderer(spec, obstacle_list(world))
+        renderer = MeshRenderer(spec, obstacle_list(world), world.attached)
         renderer.check()
         return renderer
     except (RuntimeError, OSError, ValueError):

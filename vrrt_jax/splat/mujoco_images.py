@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 import mujoco
 import numpy as np
 
+from vrrt_jax.scene.held import HeldObject
 from vrrt_jax.scene.obstacle_kinds import KINDS
 from vrrt_jax.scene.obstacles import Obstacle
 from vrrt_jax.splat.types import Camera
@@ -35,16 +36,24 @@ class MeshRenderer:
     Args:
         spec: the robot with its visual meshes; it is compiled here.
         obstacles: drawn by :meth:`scene`; in :meth:`picture` they only hide the robot.
+        attached: what the robot holds, drawn likewise.
         light: brightness of the lamp; 1 is what self-models are trained with.
     """
 
     def __init__(
-        self, spec: mujoco.MjSpec, obstacles: Sequence[Obstacle] = (), *, light: float = 1.0
+        self,
+        spec: mujoco.MjSpec,
+        obstacles: Sequence[Obstacle] = (),
+        attached: Sequence[HeldObject] = (),
+        *,
+        light: float = 1.0,
     ):
         """Compile the model; raises RuntimeError if OpenGL is not available."""
         spec = spec.copy()
-        for obstacle in obstacles:
-            spec.worldbody.add_geom(
+        standing = [(spec.worldbody, obstacle) for obstacle in obstacles]
+        carried = [(spec.body(held.body), held.obstacle) for held in attached]
+        for body, obstacle in standing + carried:
+            body.add_geom(
                 name=f"obstacle {obstacle.name}",
                 type=KINDS[obstacle.kind].geom,
                 pos=obstacle.position,
