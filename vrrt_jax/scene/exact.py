@@ -42,6 +42,7 @@ class _Compiled:
     num_bodies: int  # bodies from this index on are obstacles, one each
     slots: Mapping[str, np.ndarray]  # of each kind of obstacle, its geoms
     robot_geoms: np.ndarray  # (r,) int, geoms of moving bodies that are checked against obstacles
+    lever_arms: np.ndarray  # (D, nbody, nbody) see ``exact_slots.lever_arms``
     held_bodies: tuple[int, ...]  # bodies of the held objects
     holder: "ExactScene | None" = None  # whose obstacles stand in it now
 
@@ -89,7 +90,8 @@ class ExactScene:
     @functools.cached_property
     def lever_arms(self) -> np.ndarray:
         """(D, nbody, nbody) see :func:`vrrt_jax.scene.exact_slots.lever_arms`."""
-        return lever_arms(self.model)
+        # What is held has other places and sizes than where it was compiled; obstacles stand still.
+        return lever_arms(self.model) if self.attached else self.compiled.lever_arms
 
     def near(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distances (c,) [m] and pairs of bodies (c, 2) that are nearer than :data:`NEAR`.
@@ -302,6 +304,7 @@ def _build(
         num_bodies=num_bodies,
         slots=slots_of(model, num_bodies),
         robot_geoms=np.flatnonzero(sees_obstacles & is_moving),
+        lever_arms=lever_arms(model),
         held_bodies=held_bodies,
     )
 
