@@ -1,6 +1,7 @@
 """The tree: allocation, insertion, nearest neighbors and the way back to the root."""
 
 import dataclasses
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
@@ -17,6 +18,7 @@ Array = jax.Array | np.ndarray
 UNREACHED = 1e3  # [rad] cost of a root that is not known to be reachable from the first
 
 
+@partial(jax.jit, static_argnames="capacity")
 def create(
     q: Array,
     score: Array,
@@ -24,7 +26,7 @@ def create(
     capacity: int,
     cost: Array | float = 0.0,
 ) -> Tree[Payload]:
-    """A tree, or a forest of R roots; made on the host.
+    """A tree, or a forest of R roots.
 
     Args:
         q: (R, D) root configurations.
@@ -35,24 +37,20 @@ def create(
     """
     roots = q.shape[0]
 
-    def padded(leaf: Any, fill: float) -> np.ndarray:
-        # On the host, where a dozen small operations cost nothing.
-        values = np.asarray(leaf)
-        column = np.full((capacity, *values.shape[1:]), fill, values.dtype)
-        column[:roots] = values
-        return column
+    def padded(leaf: Any, fill: float) -> jax.Array:
+        leaf = jnp.asarray(leaf)
+        return jnp.full((capacity, *leaf.shape[1:]), fill, leaf.dtype).at[:roots].set(leaf)
 
-    columns: dict[str, Any] = {
-        "q": padded(q, 0),
-        "parent": np.full(capacity, -1, np.int32),
-        "cost": padded(np.broadcast_to(np.asarray(cost, q.dtype), roots), 0),
-        "score": padded(score, np.inf),
-        "size": np.int32(roots),
-        "iteration": np.int32(0),
-        "rejected": np.zeros(len(Rejection), np.int32),
-        "payload": jax.tree.map(lambda leaf: padded(leaf, 0), payload),
-    }
-    return Tree(**jax.device_put(columns))
+    return Tree(
+        q=padded(q, 0),
+        parent=jnp.full(capacity, -1, jnp.int32),
+        cost=padded(jnp.broadcast_to(jnp.asarray(cost, q.dtype), roots), 0),
+        score=padded(score, jnp.inf),
+        size=jnp.int32(roots),
+        iteration=jnp.int32(0),
+        rejected=jnp.zeros(len(Rejection), jnp.int32),
+        payload=jax.tree.map(lambda leaf: padded(leaf, 0), payload),
+    )
 
 
 def root_costs(num: int) -> np.ndarray:
