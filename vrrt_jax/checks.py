@@ -58,6 +58,12 @@ def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.n
             f"the world is of a robot with joints {', '.join(world.joint_names)}; this one, "
             f"'{robot.name}', has {', '.join(robot.joint_names)}: build the world for it"
         )
+    built_for = world.robot.value
+    if built_for is not None and built_for.frozen != robot.frozen:
+        raise ValueError(
+            f"the world is of a robot whose joints are fixed at {dict(built_for.frozen)}; those of "
+            f"this one, '{robot.name}', are at {dict(robot.frozen)}: build the world for it"
+        )
     q = check_limits(robot, q, what)
     if not bool(batch_is_free(world, jnp.asarray(q)[None])[0]):
         touching = (

@@ -47,7 +47,8 @@ def attach(
     An object often stands on something where it is gripped, and is modeled to sink in a little. So
     from then on the object may be as deep in each obstacle as it was at ``q``, and 1 mm more. That
     goes for the exact check. The planner lets each sphere be as near to each obstacle as it was at
-    ``q``, even within a margin. An obstacle that the object is in by more than 15 mm at ``q`` gets
+    ``q``, even within a margin, and checks the object's corners where spheres stuck out into
+    something there. An obstacle that the object is in by more than 15 mm at ``q`` gets
     nothing of this: the object is in collision there.
 
     The number of spheres is a part of the compiled program, in multiples of eight: attaching may

@@ -4,11 +4,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from vrrt_jax.checks import check_start
 from vrrt_jax.robots import load_robot
 from vrrt_jax.robots.mesh_sources import mesh_file
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.obstacles import Obstacle
 from vrrt_jax.scene.verify import contacts
+from vrrt_jax.scene.world import build_world
 
 FINGERS = {
     "panda": ("finger_joint1", "finger_joint2", "left_finger", "right_finger"),
@@ -66,6 +68,13 @@ def test_a_thin_post_fits_between_open_fingers_only():
     ]
     assert found[0] == []
     assert {"left_finger touches post", "right_finger touches post"} <= {*found[1]}
+
+
+def test_a_world_of_another_opening_is_refused():
+    robot = load_robot("panda", freeze={"finger_joint1": 0.01})
+    world = build_world(load_robot("panda"), engine="closed_form")
+    with pytest.raises(ValueError, match="fixed at {'finger_joint1': 0.04, .*: 0.01, .*build the"):
+        check_start(robot, world, robot.home)
 
 
 def test_openings_that_make_no_sense_are_refused():
