@@ -15,7 +15,7 @@ VRRT_ROOMS = (
     ("splat",),
     ("config", "checks", "outcome"),
     ("visual",),
-    ("attempts",),
+    ("attempts", "joint"),
     ("planner", "problems"),
     ("report", "viz"),
     ("bench",),

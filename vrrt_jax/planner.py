@@ -248,7 +248,7 @@ def plan_batch(
         try:
             if isinstance(goal, ConfigurationGoal) != isinstance(goals[0], ConfigurationGoal):
                 raise ValueError(
-                    f"the goal is a {type(goal).__name__} and that of problem 0 a "
+                    f"the goal is an object of {type(goal).__name__}, that of problem 0 of "
                     f"{type(goals[0]).__name__}; expected goals of one kind"
                 )
             starts.append(checks.check_start(robot, own, q_start))

@@ -232,10 +232,10 @@ def test_what_is_no_goal_and_what_is_no_planner_is_refused(panda, open_world):
         vrrt_jax.plan(panda, open_world, goal, Q_START, key=key, planner=object())
 
 
-def test_a_batch_of_joint_goals_is_refused(panda, open_world):
-    goals = [vrrt_jax.ConfigurationGoal(q=Q_GOAL)] * 2
+def test_a_batch_has_goals_of_one_kind(panda, open_world, self_model, camera, image):
+    goals = [vrrt_jax.ConfigurationGoal(q=Q_GOAL), ImageGoal(self_model, camera, image)]
     starts = np.stack([Q_START] * 2)
-    with pytest.raises(ValueError, match="problem 0: a batch searches by loss"):
+    with pytest.raises(ValueError, match="problem 1: the goal is an object of ImageGoal, that"):
         vrrt_jax.plan_batch(panda, open_world, goals, starts, key=jax.random.key(0))
 
 
