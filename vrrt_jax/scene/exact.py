@@ -147,10 +147,8 @@ class ExactScene:
             speeds: (nbody, nbody) from :meth:`speeds`.
         """
         distance, bodies = near
-        span = NEAR / speeds.max()  # what is not near is at least so far away
-        if len(distance):
-            span = min(span, np.min(distance / speeds[bodies[:, 0], bodies[:, 1]]))
-        return float(span)
+        far = NEAR / speeds.max()  # what is not near is at least so far away
+        return float((distance / speeds[bodies[:, 0], bodies[:, 1]]).min(initial=far))
 
     def clearance(self, best: float) -> float:
         """Distance [m] of moving geoms to obstacles, at the latest argument of :meth:`touching`.

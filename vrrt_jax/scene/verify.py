@@ -87,7 +87,7 @@ def _first_contact(exact: ExactScene, walk: "Walk", end: int) -> tuple[str | Non
     while index < end:
         checked += 1
         near = exact.near(walk.q[index])
-        if np.any(near[0] < 0):
+        if near[0].min(initial=0.0) < 0:
             pair = exact.touching(walk.q[index])[0]
             share = 100 * walk.fraction[index]
             return f"{exact.describe(pair)} at {share:.0f} % of the path", checked
