@@ -106,5 +106,5 @@ def finish(
     )
     # Every fourth of the small steps, and the end: what the spheres do between is next to nothing.
     seldom = np.concatenate([result.trajectory[::4], result.trajectory[-1:]])
-    clearance = batch_clearance(world, padded(seldom))
+    clearance = batch_clearance(world, padded(seldom, 512))
     return dataclasses.replace(result, clearance=float(clearance))

@@ -115,8 +115,13 @@ def _length(world: Space, q: jax.Array) -> jax.Array:
     return jnp.sum(distance(world, q[:-1], q[1:]))
 
 
-def padded(path: np.ndarray) -> np.ndarray:
-    """A path (P, D) with its last waypoint repeated: few sizes, so few compilations."""
+def padded(path: np.ndarray, least: int = 64) -> np.ndarray:
+    """A path (P, D) with its last waypoint repeated: few sizes, so few compilations.
+
+    Args:
+        path: (P, D).
+        least: smallest size, a power of two.
+    """
     path = np.asarray(path, np.float32)
-    room = max(64, 1 << (len(path) + 2).bit_length())
+    room = max(least, 1 << (len(path) + 2).bit_length())
     return np.concatenate([path, np.repeat(path[-1:], room - len(path), axis=0)])
