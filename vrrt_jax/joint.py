@@ -14,7 +14,7 @@ from vrrt_jax.core.check_protocols import check_extracted_path
 from vrrt_jax.core.command import usable_cores
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.interrupt import interruptible
-from vrrt_jax.core.result import STATUS_OF, PlanResult, Status
+from vrrt_jax.core.result import ABORTED, STATUS_OF, PlanResult, Status, with_time_of
 from vrrt_jax.core.search import SearchResult, StopReason, make_termination, search
 from vrrt_jax.core.types import ExpansionPolicy
 from vrrt_jax.outcome import JOINT_ADVICE, Chosen, finish, time_left
@@ -36,10 +36,9 @@ def plan_to_goal(
     config: PlannerConfig,
     on_progress: Progress,
 ) -> PlanResult:
-    """Search, extract the policy's path, shorten and verify it.
+    """Search, extract the policy's path, shorten and verify it; again, with another key, if not.
 
-    The search keeps ``config.path.margin`` from everything, or less where start or goal are nearer
-    than that. If no path does, it is searched for once more without.
+    Random trees need many times longer now and then: beginning afresh is the cure for that.
 
     Args:
         robot: whose path it is.
@@ -51,13 +50,40 @@ def plan_to_goal(
         config: settings.
         on_progress: called with the search state and the seconds so far.
     """
+    results: list[PlanResult] = []
+    with interruptible():
+        for attempt in range(config.budget.attempts):
+            own_key = jax.random.fold_in(key, attempt) if attempt else key
+            spent_s = sum(result.timing["search_s"] for result in results)
+            own = time_left(config, spent_s)
+            results.append(_attempt(robot, world, goal, policy, q_start, own_key, own, on_progress))
+            if results[-1].ok or results[-1].status in ABORTED:
+                break
+    return with_time_of(results[-1], *results)
+
+
+def _attempt(
+    robot: Robot,
+    world: World,
+    goal: ConfigurationGoal,
+    policy: ExpansionPolicy,
+    q_start: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
+    on_progress: Progress,
+) -> PlanResult:
+    """One attempt, which keeps ``config.path.margin`` from everything if it can.
+
+    It keeps less where start or goal are nearer than that. If no path is found soon, one is
+    searched for without.
+    """
     wary = keeping_clearance(world, np.stack([q_start, goal.q]), config.path.margin)
     limit = config.budget.max_iterations
     first = limit if wary is world else max(int(WARY_SHARE * limit), 1)
     found, path = _search(wary, goal, policy, q_start, key, first, config, on_progress)
     if path is None and wary is not world and found.stopped is StopReason.ITERATIONS:
-        config = time_left(config, found.search_s)
-        again, path = _search(world, goal, policy, q_start, key, limit - first, config, on_progress)
+        left = time_left(config, found.search_s)
+        again, path = _search(world, goal, policy, q_start, key, limit - first, left, on_progress)
         found = dataclasses.replace(
             again,
             compile_s=found.compile_s + again.compile_s,

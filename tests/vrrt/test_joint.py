@@ -1,6 +1,5 @@
 """Plans to joint goals: the clearance that they keep, and many at once."""
 
-import dataclasses
 import signal
 
 import jax
@@ -9,6 +8,7 @@ import pytest
 from core_cases import GOAL, START
 
 import vrrt_jax
+import vrrt_jax.joint
 from vrrt_jax import ConfigurationGoal, Obstacle, PlannerConfig, Status
 from vrrt_jax.scene.verify import interpolate
 from vrrt_jax.scene.world import keeping_clearance
@@ -51,16 +51,32 @@ def test_less_is_kept_where_an_end_is_nearer(panda, wall_world):
     assert result.ok and 0.002 < result.clearance < 0.006
 
 
-def test_a_gap_that_leaves_no_margin_is_gone_through(panda):
-    """Beside the straight way stand two posts, 4 mm from the arm: with 10 mm there is no path."""
-    q = np.array([0.0, 0.5, 0.0, -1.6, 0.0, 2.0, 0.8], np.float32)
-    ends = np.stack([q, q])
-    ends[:, 5] -= [0.25, -0.25]
-    world = vrrt_jax.build_world(panda, [])
-    wary = keeping_clearance(world, ends, 0.01)
-    assert wary is not world
-    tight = dataclasses.replace(world, margin=world.margin)
-    assert keeping_clearance(tight, ends, 0.0) is tight
+def test_the_margin_that_is_kept_is_the_widest_that_ends_allow(wall_world):
+    ends = np.stack([START, GOAL])
+    clear = float(np.min([vrrt_jax.obstacle_clearance(wall_world, q) for q in ends]))
+    fits = keeping_clearance(wall_world, ends, 0.9 * clear)
+    np.testing.assert_allclose(fits.margin, 0.9 * clear, rtol=1e-5)
+    half = keeping_clearance(wall_world, ends, 1.5 * clear)
+    np.testing.assert_allclose(half.margin, 0.75 * clear, rtol=1e-5)
+    assert keeping_clearance(wall_world, ends, 0.0) is wall_world
+    blocked = (START + GOAL)[None] / 2
+    assert keeping_clearance(wall_world, blocked, 0.01) is wall_world
+
+
+def test_another_attempt_begins_from_another_key(panda, wall_world, monkeypatch):
+    keys = []
+
+    def search(world, goal, policy, tree, *, key, **rest):
+        keys.append(jax.random.key_data(key).tolist())
+        return real(world, goal, policy, tree, key=key, **rest)
+
+    real = vrrt_jax.joint.search
+    monkeypatch.setattr(vrrt_jax.joint, "search", search)
+    few = {"budget.max_iterations": 1, "path.margin": 0.0}
+    result = plan(panda, wall_world, **few, **{"budget.attempts": 3})
+    assert result.status is Status.MAX_ITERATIONS
+    assert len({str(key) for key in keys}) == len(keys) == 3
+    assert result.expansions == 3 * 32
 
 
 def worlds_of(world):

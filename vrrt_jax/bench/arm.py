@@ -98,9 +98,36 @@ def run(
             say(f"{own.name}: {'; '.join(own.differences)}")
         if own.name not in results["scenes"]:
             results["scenes"][own.name] = _run_scene(benchmark, world, own)
+            results |= _totals(results["scenes"])
             if results_file is not None:
                 write(Path(results_file), results)
     return results
+
+
+def _totals(scenes: Mapping[str, Any]) -> dict[str, Any]:
+    """What is told of all files together: rates of batches, and peers by name."""
+    totals: dict[str, Any] = {}
+    timed = [scene for scene in scenes.values() if scene.get("batch_problems_per_s")]
+    if timed:
+        tried = [len(scene["rows"]) for scene in timed]
+        seconds = sum(
+            num / scene["batch_problems_per_s"] for num, scene in zip(tried, timed, strict=True)
+        )
+        totals["batch_problems_per_s"] = round(sum(tried) / seconds, 2)
+    names = {name for scene in scenes.values() for name in scene.get("peers", {})}
+    if names:
+        totals["peers"] = {
+            name: {
+                "scenes": {
+                    file: {"n": scene["n"], "refused": scene["refused"]}
+                    | {key: part for key, part in scene["peers"][name].items() if key != "rows"}
+                    for file, scene in scenes.items()
+                    if name in scene.get("peers", {})
+                }
+            }
+            for name in sorted(names)
+        }
+    return totals
 
 
 def _check(benchmark: ArmBenchmark) -> None:

@@ -138,9 +138,9 @@ def _checker(robot: Robot, trial: Trial) -> Callable[[Any], bool]:
 @functools.cache
 def _ompl(seed: int) -> Any:
     """The package, silent and seeded."""
-    import ompl.base
-    import ompl.geometric
-    import ompl.util
+    import ompl.base  # pyright: ignore[reportMissingImports]
+    import ompl.geometric  # pyright: ignore[reportMissingImports]
+    import ompl.util  # pyright: ignore[reportMissingImports]
 
     ompl.util.RNG.setSeed(seed + 1)  # zero would be a random one
     ompl.util.setLogLevel(ompl.util.LogLevel.LOG_NONE)

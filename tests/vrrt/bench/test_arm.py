@@ -103,6 +103,25 @@ def test_results_tell_all_that_matters(done):
     assert 0 < scene["median_ms"] <= scene["p95_ms"]
 
 
+def test_totals_of_all_files_stand_beside_them():
+    def scene(num, rate, cost):
+        rows = [{"index": k} for k in range(num)]
+        peer = {"solved": num, "cost": cost, "rows": rows}
+        return {
+            "n": num,
+            "refused": [],
+            "rows": rows,
+            "batch_problems_per_s": rate,
+            "peers": {"RRTConnect": peer},
+        }
+
+    totals = arm._totals({"first": scene(10, 5.0, 1.0), "second": scene(20, 20.0, 2.0)})
+    assert totals["batch_problems_per_s"] == 10.0  # 30 problems in 2 + 1 s
+    peers = totals["peers"]["RRTConnect"]["scenes"]
+    assert peers["second"] == {"n": 20, "refused": [], "solved": 20, "cost": 2.0}
+    assert arm._totals({}) == {}
+
+
 def test_the_table_has_a_row_for_each_file(done):
     results, _ = done
     text = arm_table.to_text(results)
