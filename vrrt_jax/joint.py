@@ -79,11 +79,17 @@ def _attempt(
     """
     wary = keeping_clearance(world, np.stack([q_start, goal.q]), config.path.margin)
     limit = config.budget.max_iterations
-    first = limit if wary is world else max(int(WARY_SHARE * limit), 1)
+    # A planner that goes on to improve gets all of its iterations with the clearance.
+    improves = policy.goal_score(goal) == -np.inf
+    first = limit if improves or wary is world else max(int(WARY_SHARE * limit), 1)
     found, path = _search(wary, goal, policy, q_start, key, first, config, on_progress)
-    if path is None and wary is not world and found.stopped is StopReason.ITERATIONS:
+    is_there = path is not None and float(goal.loss(world, jnp.asarray(path[-1]))) <= float(
+        goal.threshold
+    )
+    if not is_there and wary is not world and found.stopped is StopReason.ITERATIONS:
         left = time_left(config, found.search_s)
-        again, path = _search(world, goal, policy, q_start, key, limit - first, left, on_progress)
+        rest = limit if improves else max(limit - first, 1)
+        again, path = _search(world, goal, policy, q_start, key, rest, left, on_progress)
         found = dataclasses.replace(
             again,
             compile_s=found.compile_s + again.compile_s,

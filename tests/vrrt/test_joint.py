@@ -135,3 +135,32 @@ def test_ctrl_c_ends_a_batch_with_results(panda, wall_world):
     )
     assert [result.status for result in results] == [Status.INTERRUPTED] * 3
     assert all(result.iterations <= 8 for result in results)
+
+
+def test_a_planner_that_improves_has_all_its_iterations(panda, wall_world):
+    """With a clearance to keep, and without."""
+    config = PlannerConfig().changed({"budget.max_iterations": 40})
+    goal = ConfigurationGoal(q=START + np.array([-0.4, 0, 0, 0, 0, 0, 0], np.float32))
+    planner = vrrt_jax.RRTStar.for_world(wall_world, goal_bias=0.3)
+    result = vrrt_jax.plan(panda, wall_world, goal, START, key=KEY, planner=planner, config=config)
+    assert result.ok and result.iterations == 40
+
+
+def test_without_a_path_that_keeps_the_margin_one_without_is_searched_for(
+    panda, wall_world, monkeypatch
+):
+    """A tree of one branch that never reaches the goal is no path to it."""
+    searched = []
+
+    def search(world, goal, policy, tree, **rest):
+        searched.append(float(world.margin))
+        return real(world, goal, policy, tree, **rest)
+
+    real = vrrt_jax.joint.search
+    monkeypatch.setattr(vrrt_jax.joint, "search", search)
+    config = PlannerConfig().changed({"budget.max_iterations": 20, "budget.attempts": 1})
+    planner = vrrt_jax.RRT.for_world(wall_world, goal_bias=0.0)
+    goal = ConfigurationGoal(q=GOAL)
+    result = vrrt_jax.plan(panda, wall_world, goal, START, key=KEY, planner=planner, config=config)
+    assert not result.ok
+    np.testing.assert_allclose(searched, [0.01, 0.0], atol=1e-6)
