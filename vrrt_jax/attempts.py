@@ -1,7 +1,7 @@
 """Plans to goals that are known by their loss: seeds, a search, its end; and again if it failed."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -14,7 +14,7 @@ from vrrt_jax.core.result import ABORTED, PlanResult, Status, with_time_of
 from vrrt_jax.core.search import make_termination, search
 from vrrt_jax.core.timing import timed
 from vrrt_jax.core.types import ExpansionPolicy, Goal, Tree
-from vrrt_jax.outcome import time_left
+from vrrt_jax.outcome import Progress, time_left
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.world import World
 from vrrt_jax.visual.finish import finish_visual
@@ -24,8 +24,6 @@ from vrrt_jax.visual.seeds import sample_seeds, seeded_roots
 
 SEED_KEY = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
 RETRYABLE = (Status.NO_MATCH, Status.NO_PATH, Status.NOT_VERIFIED)  # worth another attempt
-
-Progress = Callable[..., Any] | None
 
 
 def plan_by_loss(

@@ -1,9 +1,8 @@
 """Plans to joint goals: a search that keeps a clearance where it can, and batches of them."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +16,11 @@ from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.result import ABORTED, STATUS_OF, PlanResult, Status, with_time_of
 from vrrt_jax.core.search import SearchResult, StopReason, make_termination, search
 from vrrt_jax.core.types import ExpansionPolicy
-from vrrt_jax.outcome import JOINT_ADVICE, Chosen, finish, time_left
+from vrrt_jax.outcome import JOINT_ADVICE, Chosen, Progress, finish, time_left
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.world import World, keeping_clearance
 
 WARY_SHARE = 0.15  # of the iterations are searched with a clearance to keep, then without
-
-Progress = Callable[..., Any] | None
 
 
 def plan_to_goal(
@@ -83,30 +80,36 @@ def _attempt(
     improves = policy.goal_score(goal) == -np.inf
     first = limit if improves or wary is world else max(int(WARY_SHARE * limit), 1)
     found, path = _search(wary, goal, policy, q_start, key, first, config, on_progress)
-    is_there = path is not None and float(goal.loss(world, jnp.asarray(path[-1]))) <= float(
-        goal.threshold
-    )
+    chosen = _chosen(world, goal, path, q_start)
+    is_there = path is not None and chosen.loss <= chosen.threshold
     if not is_there and wary is not world and found.stopped is StopReason.ITERATIONS:
         left = time_left(config, found.search_s)
         rest = limit if improves else max(limit - first, 1)
         again, path = _search(world, goal, policy, q_start, key, rest, left, on_progress)
+        chosen = _chosen(world, goal, path, q_start)
         found = dataclasses.replace(
             again,
             compile_s=found.compile_s + again.compile_s,
             search_s=found.search_s + again.search_s,
         )
-    end = q_start if path is None else path[-1]
-    chosen = Chosen(
-        path=path,
-        target=np.asarray(goal.q),
-        loss=float(goal.loss(world, jnp.asarray(end))),
-        threshold=float(goal.threshold),
-    )
     result = finish(robot, world, found, chosen, q_start, key, config)
     status = result.status
     if path is None:
         status = STATUS_OF.get(found.stopped, Status.NO_PATH)
     return dataclasses.replace(result, status=status, advice=JOINT_ADVICE[status])
+
+
+def _chosen(
+    world: World, goal: ConfigurationGoal, path: np.ndarray | None, q_start: np.ndarray
+) -> Chosen:
+    """Where a path, or the start without one, stands to the goal."""
+    end = q_start if path is None else path[-1]
+    return Chosen(
+        path=path,
+        target=np.asarray(goal.q),
+        loss=float(goal.loss(world, jnp.asarray(end))),
+        threshold=float(goal.threshold),
+    )
 
 
 def _search(

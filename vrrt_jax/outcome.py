@@ -1,6 +1,8 @@
 """How a plan ends: from the chosen path to a result, and what to try next."""
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,6 +15,8 @@ from vrrt_jax.core.shortcut import padded
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.verify import check_path
 from vrrt_jax.scene.world import World, batch_clearance, keeping_clearance
+
+Progress = Callable[..., Any] | None  # called with the search state and the seconds so far
 
 # What to try next, by how a plan to an image ended.
 ADVICE = {

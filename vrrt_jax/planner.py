@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax import checks
-from vrrt_jax.attempts import Progress, plan_batch_by_loss, plan_by_loss
+from vrrt_jax.attempts import plan_batch_by_loss, plan_by_loss
 from vrrt_jax.config import PlannerConfig, check_config
 from vrrt_jax.core.check_protocols import check_goal, check_policy
 from vrrt_jax.core.goal import ConfigurationGoal
@@ -17,6 +17,7 @@ from vrrt_jax.core.planners import PLANNERS, RRT, RRTStar
 from vrrt_jax.core.result import PlanResult
 from vrrt_jax.core.types import ExpansionPolicy, Goal
 from vrrt_jax.joint import plan_each_to_configuration, plan_to_goal
+from vrrt_jax.outcome import Progress
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.world import World
 from vrrt_jax.splat.model import SelfModel

@@ -49,8 +49,7 @@ class ClosedFormWorld(World):
 
     def obstacle_clearance(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.obstacle_clearance`."""
-        centers = place(self.spheres.collision, link_poses(self.chain, q))
-        return jnp.min(self.spheres.clearances(self.obstacles, centers))
+        return self.spheres.smallest_clearance(self.obstacles, link_poses(self.chain, q))
 
     def holding(self, attached: Sequence[HeldObject]) -> Self:
         """See :meth:`vrrt_jax.scene.world.World.holding`."""

@@ -91,8 +91,7 @@ class MjxWorld(World):
 
     def obstacle_clearance(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.obstacle_clearance`; in closed form, as MJX has none."""
-        centers = place(self.spheres.collision, link_poses(self.chain, q))
-        return jnp.min(self.spheres.clearances(self.obstacles, centers))
+        return self.spheres.smallest_clearance(self.obstacles, link_poses(self.chain, q))
 
     def _held_are_free(self, q: jax.Array) -> jax.Array | bool:
         """Whether what the robot holds touches nothing, () bool."""

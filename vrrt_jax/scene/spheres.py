@@ -43,6 +43,10 @@ class WorldSpheres:
         needed = jnp.minimum(self.radius[:, None] + margin, self.gripped_distance)
         return jnp.min(signed_distances(obstacles, centers) - needed, axis=1)
 
+    def smallest_clearance(self, obstacles: Obstacles, poses: jax.Array) -> jax.Array:
+        """Of all collision spheres, () [m], on links posed by (L, 4, 4)."""
+        return jnp.min(self.clearances(obstacles, place(self.collision, poses)))
+
     def squared_gaps(self, centers: jax.Array) -> jax.Array:
         """Squared distances less squared contact distances (m, m) [m^2] of spheres at (3, m)."""
         return _squared_distances(centers) - self.contact_distance**2
