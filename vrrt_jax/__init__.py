@@ -9,10 +9,10 @@ _choose_backend()  # before anything imports MuJoCo
 from vrrt_jax.config import (  # noqa: E402
     Budget,
     ExpandConfig,
+    LineageConfig,
     MatchConfig,
     PlannerConfig,
     PolishConfig,
-    SeedConfig,
     TreeConfig,
 )
 from vrrt_jax.core.edges import Space, difference, distance  # noqa: E402
@@ -81,7 +81,7 @@ __all__ = [
     "RRTConnect",
     "RRTStar",
     "Robot",
-    "SeedConfig",
+    "LineageConfig",
     "SelfModel",
     "Space",
     "SplatModel",

@@ -1,4 +1,4 @@
-"""Plans to goals that are known by their loss: seeds, a search, its end; and again if it failed."""
+"""Plans to goals that are known by their loss: a search, its end; and again if it failed."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -13,16 +13,17 @@ from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.result import ABORTED, PlanResult, Status, with_time_of
 from vrrt_jax.core.search import make_termination, search
 from vrrt_jax.core.timing import timed
-from vrrt_jax.core.types import ExpansionPolicy, Goal, Tree
+from vrrt_jax.core.types import ExpansionPolicy, Goal
 from vrrt_jax.outcome import Progress, time_left
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.world import World
+from vrrt_jax.visual import lineages
+from vrrt_jax.visual import policy as published
 from vrrt_jax.visual.finish import finish_visual
-from vrrt_jax.visual.policy import tree_from_roots
+from vrrt_jax.visual.lineages import LineageRRT
 from vrrt_jax.visual.problem import VisualProblem
-from vrrt_jax.visual.seeds import sample_seeds, seeded_roots
 
-SEED_KEY = 0x7FFFFFFF  # folded into the key before the search, whose iterations count from 0
+ATTEMPT_KEY = 0x7FFFFFFF  # folded into the key of a later attempt; iterations count from 0
 RETRYABLE = (Status.NO_MATCH, Status.NO_PATH, Status.NOT_VERIFIED)  # worth another attempt
 
 
@@ -36,14 +37,14 @@ def plan_by_loss(
     config: PlannerConfig,
     on_progress: Progress,
 ) -> PlanResult:
-    """Attempts from different seeds, until one is solved; the best of them."""
+    """Attempts with different keys, until one is solved; the best of them."""
     with interruptible():
         result = attempt(robot, world, problem, policy, roots, key, config, on_progress)
         for again in range(1, config.budget.attempts):
             rest = time_left(config, result.timing["search_s"])
             if result.status not in RETRYABLE or rest.budget.time_limit_s == 0:
                 break
-            key = jax.random.fold_in(key, SEED_KEY - again)
+            key = jax.random.fold_in(key, ATTEMPT_KEY - again)
             other = attempt(robot, world, problem, policy, roots, key, rest, on_progress)
             if other.status in ABORTED and not other.ok:
                 # It ended before its loss could be compared with the other's.
@@ -64,8 +65,12 @@ def attempt(
     config: PlannerConfig,
     on_progress: Progress,
 ) -> PlanResult:
-    """Sample seeds around the start (the first of the roots), search and finish, once."""
-    tree, compile_s, seed_s = seeded_tree(world, problem, policy, roots, key, config)
+    """Search from the start (the first of the roots), and finish, once."""
+    tree, compile_s, _ = timed(
+        lambda: policy.init(world, problem.goal, roots, config.tree.capacity),
+        lineages.tree_from_roots,
+        published.tree_from_roots,
+    )
     found = search(
         world,
         problem.goal,
@@ -73,32 +78,12 @@ def attempt(
         tree,
         key=key,
         termination=termination_of(config, policy, problem.goal),
-        time_limit_s=time_left(config, seed_s).budget.time_limit_s,
+        time_limit_s=config.budget.time_limit_s,
         max_capacity=config.tree.max_capacity,
         on_progress=on_progress,
     )
-    found = dataclasses.replace(
-        found, compile_s=found.compile_s + compile_s, search_s=found.search_s + seed_s
-    )
+    found = dataclasses.replace(found, compile_s=found.compile_s + compile_s)
     return finish_visual(robot, world, problem, policy, found, roots[0], key, config)
-
-
-def seeded_tree(
-    world: World,
-    problem: VisualProblem,
-    policy: ExpansionPolicy,
-    roots: np.ndarray,
-    key: jax.Array,
-    config: PlannerConfig,
-) -> tuple[Tree, float, float]:
-    """The forest before the search, and the seconds for its compilation and for itself."""
-    key = jax.random.fold_in(key, SEED_KEY)
-
-    def grow() -> Tree:
-        all_roots = seeded_roots(world, problem.seeds, roots, key)
-        return policy.init(world, problem.goal, all_roots, config.tree.capacity)
-
-    return timed(grow, sample_seeds, tree_from_roots)
 
 
 def termination_of(config: PlannerConfig, policy: ExpansionPolicy, goal: Goal) -> Any:
@@ -106,6 +91,7 @@ def termination_of(config: PlannerConfig, policy: ExpansionPolicy, goal: Goal) -
     budget = config.budget
     return make_termination(
         policy.goal_score(goal),
+        enough_iterations=int(policy.stages[-1]) if isinstance(policy, LineageRRT) else None,
         settle_iterations=budget.settle_iterations,
         max_iterations=budget.max_iterations,
         patience=budget.patience,
@@ -126,13 +112,10 @@ def plan_batch_by_loss(
 ) -> list[PlanResult]:
     """One attempt at each of Q problems, in one search over all of them; see ``plan_batch``."""
     with interruptible():
-        trees, compile_s, seed_s = zip(
-            *(
-                seeded_tree(world, problem, policy, q_start[None], own_key, config)
-                for problem, q_start, own_key in zip(problems, starts, keys, strict=True)
-            ),
-            strict=True,
-        )
+        trees = [
+            policy.init(world, problem.goal, q_start[None], config.tree.capacity)
+            for problem, q_start in zip(problems, starts, strict=True)
+        ]
         terminations = [termination_of(config, policy, problem.goal) for problem in problems]
         found = search(
             world,
@@ -141,7 +124,7 @@ def plan_batch_by_loss(
             _stack(trees),
             key=keys,
             termination=_stack(terminations),
-            time_limit_s=time_left(config, sum(seed_s)).budget.time_limit_s,
+            time_limit_s=config.budget.time_limit_s,
             max_capacity=config.tree.max_capacity,
             batched=True,
             on_progress=on_progress,
@@ -152,8 +135,6 @@ def plan_batch_by_loss(
                 found,
                 tree=jax.tree.map(lambda leaf: leaf[i], found.tree),  # noqa: B023 - used at once
                 stopped=found.stopped_each[i],
-                compile_s=found.compile_s + sum(compile_s),
-                search_s=found.search_s + seed_s[i],
             )
             results.append(
                 finish_visual(robot, world, problem, policy, own, q_start, keys[i], config)

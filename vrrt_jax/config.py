@@ -15,37 +15,37 @@ class TreeConfig:
     lanes: int = setting(32, 2, 4096)  # expansions an iteration
     capacity: int = setting(8192, 8)  # nodes that there is room for at first
     max_capacity: int = setting(1 << 20, 8)  # a full tree gets more room, up to this
-    image_px: int = setting(64, 8, 4096)  # image height that is searched at
-    rewiring: bool = True  # RRT*
+    image_px: int = setting(32, 8, 4096)  # image height that is searched at
+    rewiring: bool = True  # RRT*, of the published planner
     rewire_radius: float = setting(0.3, 0.0)  # [rad]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ExpandConfig:
-    """How nodes are chosen and expanded; the symbols are the paper's."""
+class LineageConfig:
+    """How the tree grows: scattered edges, lineages that jump, lineages that descend."""
 
-    alpha: float = setting(0.04, 0.0, 1.0)  # Adam step [rad]
-    epsilon: float = setting(0.04, 0.0, 1.0)  # exploration step [rad]
-    kappa: float = setting(0.9, 0.0, 1.0, below=True)  # decay of the frontier's geometric law
-    eta: float = setting(0.7, 0.0, 1.0)  # share of parents drawn by that law, not uniformly
-    exploration: float = setting(0.3, 0.0, 1.0)  # share r of lanes that explore
-    beta1: float = setting(0.9, 0.0, 1.0, below=True)
-    beta2: float = setting(0.9, 0.0, 1.0, below=True)
-    anneal: float = setting(10.0, 0.0)  # Adam steps shrink below so many match thresholds; 0 never
-    inherit: bool = True  # a child goes on with its parent's Adam moments
+    num: int = setting(64, 0, 1024)  # lineages; 0 = the published planner instead (re-compiles)
+    radius: float = setting(2.8, 0.0)  # how far edges scatter from the start [rad]
+    samples: int = setting(1024, 1, 1 << 20)  # such edges
+    jumps: int = setting(64, 0, 1 << 20)  # random changes of each lineage's best node
+    steps: int = setting(60, 1, 100_000)  # Adam steps of a lineage
+    young: int = setting(25, 0, 100_000)  # of them that every lineage takes, then the best go on
+    alpha: float = setting(0.06, 0.0, 1.0)  # first of these steps, falling to zero [rad]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SeedConfig:
-    """Samples around the start that are rendered before the search; the best become roots."""
+class ExpandConfig:
+    """How the published planner chooses and expands nodes; the symbols are the paper's."""
 
-    num: int = setting(1024, 0, 1 << 20)  # samples; 0 = none (re-compiles)
-    radius: float = setting(2.8, 0.0)  # how far from the start [rad]
-    kept: int = setting(64, 1)  # best samples, which improve and become roots (re-compiles)
-    rounds: int = setting(4, 0, 1024)  # of looking for something better around each one kept
-    steps: int = setting(60, 0, 100_000)  # Adam steps that each one kept takes after that
-    alpha: float = setting(0.06, 0.0, 1.0)  # first of these steps, falling to zero [rad]
-    px: int = setting(32, 8, 4096)  # image height (re-compiles)
+    alpha: float = setting(0.04, 0.0, 1.0)  # Adam step [rad]
+    epsilon: float = setting(0.04, 0.0, 1.0)  # shortest exploration step [rad]
+    rho: float = setting(0.7, 0.0, 10.0)  # exploration radius: its longest step [rad] (re-compiles)
+    kappa: float = setting(0.9, 0.0, 1.0, below=True)  # decay of the frontier's geometric law
+    eta: float = setting(0.7, 0.0, 1.0)  # share of parents drawn by that law, not uniformly
+    exploration: float = setting(0.3, 0.0, 1.0)  # share r of lanes that explore
+    beta1: float = setting(0.9, 0.0, 1.0, below=True)  # of lineages too
+    beta2: float = setting(0.9, 0.0, 1.0, below=True)  # of lineages too
+    inherit: bool = True  # a child goes on with its parent's Adam moments
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,6 +59,7 @@ class PolishConfig:
     rounds: int = setting(2, 1, 1024)  # of sampling and descending; twice as many without a match
     spread: float = setting(0.8, 0.0)  # of a joint in the first round, half of that next [rad]
     steps: int = setting(4, 0, 1024)  # Levenberg-Marquardt, in each round and at the end
+    coarse_px: int = setting(64, 8, 4096)  # image height in these rounds (re-compiles)
     px: int = setting(128, 8, 4096)  # image height at the end (re-compiles)
     close_px: int = setting(480, 0, 4096)  # image height that a close-up is cut from; 0 = none
     # Weight of the prior toward the start: added loss per rad^2, in units of the match threshold.
@@ -81,10 +82,10 @@ class Budget:
     max_iterations: int = setting(400, 1)
     settle_iterations: int = setting(6, 0)  # once matched, iterations without improvement
     # Iterations without improvement after which it gives up; None = no limit.
-    patience: int | None = setting(25, 1, optional=True)
+    patience: int | None = setting(None, 1, optional=True)
     min_improvement: float = setting(0.0, 0.0)  # an improvement is a loss this much smaller ...
     min_ratio: float = setting(0.97, 0.0, 1.0)  # ... and below this share of the one before
-    attempts: int = setting(2, 1, 1024)  # the later ones from other seeds, without a verified path
+    attempts: int = setting(2, 1, 1024)  # the later ones with other keys, without a verified path
     time_limit_s: float = setting(float("inf"), 0.0)  # of all searches, compilation excluded [s]
     connect_iterations: int = setting(400, 1)  # of RRT-Connect, to a match
     shortcut_rounds: int = setting(150, 0)
@@ -108,8 +109,8 @@ class PlannerConfig:
     """
 
     tree: TreeConfig = TreeConfig()
+    lineages: LineageConfig = LineageConfig()
     expand: ExpandConfig = ExpandConfig()
-    seeds: SeedConfig = SeedConfig()
     polish: PolishConfig = PolishConfig()
     match: MatchConfig = MatchConfig()
     path: PathConfig = PathConfig()
@@ -122,10 +123,11 @@ class PlannerConfig:
         It searches until the loss has not improved for 100 iterations, matched or not.
         """
         return cls(
-            expand=ExpandConfig(anneal=0.0),
-            seeds=SeedConfig(num=0),
+            tree=TreeConfig(image_px=64),
+            lineages=LineageConfig(num=0),
             polish=PolishConfig(hypotheses=0),
             budget=Budget(
+                max_iterations=100_000,
                 settle_iterations=100,
                 attempts=1,
                 patience=100,
@@ -151,7 +153,7 @@ def check_config(config: PlannerConfig) -> None:
             "vrrt_jax.PlannerConfig"
         )
     settings.check_settings(config)
-    lanes, roots = config.tree.lanes, 2 + min(config.seeds.num, config.seeds.kept)
+    lanes, roots = config.tree.lanes, 2
     if config.tree.capacity > config.tree.max_capacity:
         raise ValueError(
             f"tree.capacity={config.tree.capacity} is above tree.max_capacity="

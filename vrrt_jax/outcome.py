@@ -47,6 +47,7 @@ class Chosen:
     target: np.ndarray  # (D,)
     loss: float
     threshold: float
+    tree_share: float = 1.0  # of the path's length, what the search's tree led along
 
 
 def time_left(config: PlannerConfig, spent_s: float) -> PlannerConfig:
@@ -111,4 +112,4 @@ def finish(
     # Every fourth of the small steps, and the end: what the spheres do between is next to nothing.
     seldom = np.concatenate([result.trajectory[::4], result.trajectory[-1:]])
     clearance = batch_clearance(world, padded(seldom, 512))
-    return dataclasses.replace(result, clearance=float(clearance))
+    return dataclasses.replace(result, clearance=float(clearance), tree_share=chosen.tree_share)

@@ -23,6 +23,7 @@ from vrrt_jax.scene.world import World
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera
 from vrrt_jax.visual.goal import ImageGoal
+from vrrt_jax.visual.lineages import LineageRRT
 from vrrt_jax.visual.policy import VisualRRT
 from vrrt_jax.visual.problem import make_problem
 
@@ -288,7 +289,8 @@ def _policy(
             raise ValueError(_needs_configuration(type(planner).__name__, goal))
         return planner
     if planner == VISUAL:
-        return VisualRRT.from_config(config, world)
+        policy = LineageRRT if config.lineages.num else VisualRRT
+        return policy.from_config(config, world)
     if planner not in PLANNERS:
         raise ValueError(f"unknown planner '{planner}'; have: {', '.join([*PLANNERS, VISUAL])}")
     if not has_configuration:

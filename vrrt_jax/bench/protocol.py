@@ -14,6 +14,7 @@ from vrrt_jax.scene.world import ENGINES
 ABLATIONS = {
     "paper": {
         "expand.exploration": (0.1, 0.3, 0.5, 0.7, 0.9),
+        "expand.rho": (0.7, 0.04),
         "expand.eta": (0.0, 0.2, 0.4, 0.6, 0.8, 1.0),
         "expand.kappa": (0.5, 0.8, 0.9, 0.95, 0.99),
         "expand.beta1": (0.5, 0.9, 0.99),
@@ -22,15 +23,16 @@ ABLATIONS = {
         "expand.inherit": (True, False),
     },
     "default": {
-        "seeds.num": (1024, 256, 0),
-        "seeds.rounds": (0,),
-        "seeds.steps": (0,),
+        "budget.max_iterations": (400, 1),
+        "lineages.samples": (256,),
+        "lineages.jumps": (0,),
+        "lineages.steps": (1,),
+        "lineages.num": (16, 1),
         "polish.hypotheses": (0, 1),
         "polish.rounds": (1,),
         "polish.close_px": (0,),
         "polish.start_prior": (0.0,),
         "match.start_preference": (0.0,),
-        "expand.anneal": (0.0,),
         "budget.attempts": (1,),
         "budget.settle_iterations": (0,),
     },

@@ -74,6 +74,9 @@ class PlanResult:
     tree: Tree
     # Smallest distance of the collision spheres to obstacles on the path [m], where it is measured.
     clearance: float = float("nan")
+    # Of the length of ``raw_path``, what ``tree`` and an edge from it led along. RRT-Connect, which
+    # goes on from the tree where no such edge is free, found the rest.
+    tree_share: float = 1.0
 
     @property
     def ok(self) -> bool:

@@ -25,7 +25,7 @@ class StopReason(enum.IntEnum):
     """Why a search ended."""
 
     REACHED = 0  # a node's score is at or below the goal score
-    CONVERGED = 1  # the best score no longer improves
+    CONVERGED = 1  # the best score no longer improves, or the policy has done all that it does
     ITERATIONS = 2
     TREE_FULL = 3
     TIME_LIMIT = 4
@@ -40,6 +40,7 @@ class Termination:
     # () i32 once there, go on until the best score has not improved for so long
     settle_iterations: jax.Array
     max_iterations: jax.Array  # () i32
+    enough_iterations: jax.Array  # () i32 after so many the policy has done all that it does
     patience: jax.Array  # () i32 give up after so many iterations without improvement
     min_improvement: jax.Array  # () what counts as one: so much less ...
     min_ratio: jax.Array  # () ... or below this multiple of the score before
@@ -72,16 +73,19 @@ def make_termination(
     *,
     max_iterations: int,
     settle_iterations: int = 0,
+    enough_iterations: int | None = None,
     patience: int | None = None,
     min_improvement: float = 0.0,
     min_ratio: float = 1.0,
 ) -> Termination:
-    """A stopping rule; without ``patience`` the search never counts as converged."""
+    """A stopping rule; a search counts as converged by ``enough_iterations`` or ``patience``."""
+    never = np.iinfo(np.int32).max
     numbers: dict[str, Any] = {
         "score": np.float32(score),
         "settle_iterations": np.int32(settle_iterations),
         "max_iterations": np.int32(max_iterations),
-        "patience": np.int32(patience if patience is not None else np.iinfo(np.int32).max),
+        "enough_iterations": np.int32(never if enough_iterations is None else enough_iterations),
+        "patience": np.int32(never if patience is None else patience),
         "min_improvement": np.float32(min_improvement),
         "min_ratio": np.float32(min_ratio),
     }
@@ -104,9 +108,10 @@ def stop_reason(state: SearchState, termination: Termination) -> jax.Array:
     tree = state.tree
     idle = tree.iteration - state.reference_iteration
     reached = (jnp.min(tree.score) <= termination.score) & (idle >= termination.settle_iterations)
+    enough = tree.iteration >= termination.enough_iterations
     reasons = (
         (StopReason.REACHED, reached),
-        (StopReason.CONVERGED, idle >= termination.patience),
+        (StopReason.CONVERGED, enough | (idle >= termination.patience)),
         (StopReason.ITERATIONS, tree.iteration >= termination.max_iterations),
         (StopReason.TREE_FULL, tree.size >= tree.capacity),
     )

@@ -1,7 +1,6 @@
-"""From a grown tree to a result: choose where to end, find a path there, shorten and verify it."""
+"""From a grown tree to a result: choose where to end, join that to the tree, shorten and verify."""
 
 import dataclasses
-import time
 
 import jax
 import jax.numpy as jnp
@@ -9,20 +8,16 @@ import numpy as np
 
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.check_protocols import overrides_is_free
-from vrrt_jax.core.edges import free_prefix
-from vrrt_jax.core.goal import ConfigurationGoal
-from vrrt_jax.core.planners import RRTConnect
 from vrrt_jax.core.result import EARLY_STOPS, PlanResult, Status, with_time_of
-from vrrt_jax.core.search import SearchResult, make_termination, search
+from vrrt_jax.core.search import SearchResult
 from vrrt_jax.core.timing import timed
 from vrrt_jax.core.types import ExpansionPolicy
 from vrrt_jax.outcome import Chosen, finish, time_left
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.exact import exact_scene
-from vrrt_jax.scene.verify import verify_path
 from vrrt_jax.scene.world import World, with_margin
 from vrrt_jax.visual.distinct import distances_to, distinct
+from vrrt_jax.visual.join import Way, connect, join
+from vrrt_jax.visual.lineages import LineageRRT
 from vrrt_jax.visual.policy import VisualRRT
 from vrrt_jax.visual.polish import Polished, evaluate_cost, linearize, polish
 from vrrt_jax.visual.problem import VisualProblem
@@ -30,8 +25,6 @@ from vrrt_jax.visual.problem import VisualProblem
 MAX_GOALS = 3  # matched configurations that are tried before there is no path
 MAX_REPLANS = 3  # paths that the exact check may refuse before it has the last word
 MARGIN_STEP = 0.01  # [m] by which each of them keeps farther away than the one before
-SWEEP_STEP = 0.02  # [rad] between configurations of a straight line that is tried
-SWEEP_MARGIN = 0.002  # [m] that it keeps away: what links move between two of the last check
 SAME_LOSS = 1.05  # losses within this factor are the same match
 AMBIGUITY_RATIO = 1.1  # and within this factor the image does not tell which it is
 
@@ -74,21 +67,20 @@ def finish_visual(
     search_threshold = float(problem.goal.threshold)
     found, ends = _choose_ends(world, problem, policy, found, q_start, key, config)
 
-    # Try the ends in turn: by the tree's own path, straight, or by RRT-Connect.
-    path, end = None, ends.order[0]
+    # Try the ends in turn, until the tree leads to one.
+    way, end = None, ends.order[0]
     all_collide = not np.isfinite(ends.cost[end])
     for candidate in [] if all_collide else ends.order[:MAX_GOALS]:
-        path = ends.paths.get(candidate)
-        if path is None:
-            found, path = _straight(robot, world, found, q_start, ends.q[candidate])
-        if path is None:
-            found, path = _connect(world, found, q_start, ends.q[candidate], key, config)
-        if path is not None:
+        if candidate in ends.paths:
+            way = Way(path=ends.paths[candidate], tree_share=1.0)
+        else:
+            found, way = join(world, found, ends.q[candidate], key, config)
+        if way is not None:
             end = candidate
-        if path is not None or found.stopped in EARLY_STOPS:
+        if way is not None or found.stopped in EARLY_STOPS:
             break
     target, loss = ends.q[end], float(ends.loss[end])
-    chosen = Chosen(path=path, target=target, loss=loss, threshold=ends.threshold)
+    chosen = _chosen(way, target, loss, ends.threshold)
     result = finish(robot, world, found, chosen, q_start, key, config)
 
     # A path that the exact check refuses is sought again, farther away from obstacles.
@@ -99,8 +91,8 @@ def finish_visual(
         idle = dataclasses.replace(found, compile_s=0.0, search_s=0.0)
         rest = time_left(config, result.timing["search_s"])
         farther = with_margin(world, again * MARGIN_STEP)
-        other, path = _connect(farther, idle, q_start, target, key, rest)
-        chosen = dataclasses.replace(chosen, path=path)
+        other, way = connect(farther, idle, target, key, rest)
+        chosen = _chosen(way, target, loss, ends.threshold)
         other = finish(robot, farther, other, chosen, q_start, key, config)
         other = dataclasses.replace(other, expansions=0)  # of the same search
         result = with_time_of(other if other.ok else result, result, other)
@@ -113,6 +105,11 @@ def finish_visual(
     return dataclasses.replace(
         result, alternatives=ends.q[alike], search_match_threshold=search_threshold
     )
+
+
+def _chosen(way: Way | None, target: np.ndarray, loss: float, threshold: float) -> Chosen:
+    path, share = (None, 0.0) if way is None else (way.path, way.tree_share)
+    return Chosen(path=path, target=target, loss=loss, threshold=threshold, tree_share=share)
 
 
 def _choose_ends(
@@ -145,7 +142,7 @@ def _choose_ends(
     paths = {end: trees.branch_path(found.tree, end) for end in order}
     paths = {end: path for end, path in paths.items() if np.array_equal(path[0], q_start)}
     loss = score
-    if not isinstance(policy, VisualRRT):  # whose scores are losses
+    if not isinstance(policy, VisualRRT | LineageRRT):  # whose scores are losses
         loss = score.copy()
         loss[order] = [float(problem.goal.loss(world, jnp.asarray(q[end]))) for end in order]
     # On a small image even neighbors look the same: there are no rivals to name.
@@ -202,60 +199,3 @@ def _best_nodes(
 
     matching = np.flatnonzero(np.isfinite(score) & (score <= max(threshold, score.min())))
     return distinct(world, q, matching, num, nearest_of_the_best)
-
-
-def _straight(
-    robot: Robot, world: World, found: SearchResult, q_start: np.ndarray, q_goal: np.ndarray
-) -> tuple[SearchResult, np.ndarray | None]:
-    """The straight path (2, D) if it is free; the time for the check is added to the search's.
-
-    The exact check judges, which also grants what the covering spheres refuse. A world with an
-    ``is_free`` of its own is asked as well.
-    """
-    exact_scene(robot, world)  # built once, and no part of any search
-    started = time.perf_counter()
-    path = np.stack([q_start, q_goal])
-    seen = verify_path(robot, world, path, step=SWEEP_STEP, measure_clearance=True)
-    clear = seen.ok and not seen.clearance < world.margin + SWEEP_MARGIN
-    if clear and overrides_is_free(world):
-        edge = world.edge(jnp.asarray(path[:1]), jnp.asarray(path[1:]))
-        steps = max(int(np.ceil(float(world.span(edge)[0] / world.resolution))), 1)
-        clear = int(free_prefix(world, jnp.asarray(path[:1]), edge, steps)[0]) == steps
-    spent_s = time.perf_counter() - started
-    found = dataclasses.replace(found, search_s=found.search_s + spent_s)
-    return found, path if clear else None
-
-
-def _connect(
-    world: World,
-    found: SearchResult,
-    q_start: np.ndarray,
-    q_goal: np.ndarray,
-    key: jax.Array,
-    config: PlannerConfig,
-) -> tuple[SearchResult, np.ndarray | None]:
-    """A path (P, D) by RRT-Connect, if there is one; its time is added to the search's.
-
-    If time is up meanwhile, or the user interrupts, the search has stopped for that.
-    """
-    goal = ConfigurationGoal(q=jnp.asarray(q_goal))
-    policy = RRTConnect.for_world(world, lanes=config.tree.lanes)
-    connection = search(
-        world,
-        goal,
-        policy,
-        policy.init(world, goal, q_start[None], config.tree.capacity),
-        key=key,
-        termination=make_termination(
-            policy.goal_score(goal), max_iterations=config.budget.connect_iterations
-        ),
-        time_limit_s=time_left(config, found.search_s).budget.time_limit_s,
-        max_capacity=config.tree.max_capacity,
-    )
-    found = dataclasses.replace(
-        found,
-        stopped=connection.stopped if connection.stopped in EARLY_STOPS else found.stopped,
-        compile_s=found.compile_s + connection.compile_s,
-        search_s=found.search_s + connection.search_s,
-    )
-    return found, policy.extract_path(connection.tree)

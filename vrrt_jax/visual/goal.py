@@ -100,7 +100,7 @@ class ImageGoal:
         if not jnp.any(image.valid * image.alpha > 0):
             raise ValueError(
                 f"the masks leave nothing of the robot on images of {image.alpha.shape[1]} px; "
-                "larger tree.image_px, seeds.px and polish.px keep more where many are hidden"
+                "larger tree.image_px, polish.coarse_px and polish.px keep more of it"
             )
         level = self.self_model.level_for(image.alpha.shape[1])
         splats, windows = _windowed(robot, level.splats, shrunk_cameras)

@@ -1,4 +1,4 @@
-"""Visual-RRT as a policy of the kernel: grow towards what looks like the goal image.
+"""Visual-RRT as published, as a policy of the kernel: grow towards what looks like the goal image.
 
 The score of a node is its loss. Exploiting lanes take one Adam step from a node's stored gradient,
 and the child inherits the moments; exploring lanes take a random step and start afresh.
@@ -21,6 +21,7 @@ from vrrt_jax.core.rewire import rewire
 from vrrt_jax.core.types import Expansion, Goal, Proposals, Tree, pytree, static
 from vrrt_jax.scene.world import World
 from vrrt_jax.splat.lanes import map_lanes
+from vrrt_jax.visual.adam import adam_step, fresh_moments
 
 MAX_RANK = 1024  # best nodes that the frontier's law ranks; its weight there is below 1e-40
 
@@ -50,20 +51,18 @@ class VisualRRT:
     of the same size or hyper-parameter never re-compiles.
     """
 
-    MAX_STEP: ClassVar[float] = 0.12  # [rad]
+    MAX_STEP: ClassVar[float] = 0.12  # [rad] of a gradient step
     MAX_REWIRED_EDGE: ClassVar[float] = 0.3  # [rad]
 
     alpha: Any = 0.04  # () Adam step [rad]
-    epsilon: Any = 0.04  # () exploration step [rad]
+    epsilon: Any = 0.04  # () shortest exploration step [rad]
+    rho: Any = 0.7  # () exploration radius: its longest step [rad]
     kappa: Any = 0.9  # () decay of the frontier's geometric law
     eta: Any = 0.7  # () probability of the frontier's law, against a uniform choice of parent
     exploration: Any = 0.3  # () share r of lanes that explore
     beta1: Any = 0.9  # ()
     beta2: Any = 0.9  # ()
     inherit: Any = True  # () bool, children go on with their parents' moments
-    # () loss, in units of the goal's threshold, under which Adam steps shrink with its square root;
-    # 0 = never
-    anneal: Any = 10.0
     rewire_radius: Any = 0.3  # () [rad]
     rewiring: bool = static(default=True)
     lanes: int = static(default=32)
@@ -83,7 +82,7 @@ class VisualRRT:
             rewire_radius=jnp.float32(tree.rewire_radius),
             rewiring=tree.rewiring,
             lanes=tree.lanes,
-            edge_steps=num_checks(world, cls.MAX_STEP),
+            edge_steps=num_checks(world, max(cls.MAX_STEP, expand.rho, expand.epsilon)),
             rewire_steps=num_checks(world, max(tree.rewire_radius, cls.MAX_REWIRED_EDGE)),
         )
 
@@ -125,18 +124,24 @@ class VisualRRT:
         q = tree.q[parent]
         node = jax.tree.map(lambda leaf: leaf[parent], tree.payload)
         kept = jax.tree.map(lambda leaf: jnp.where(self.inherit, leaf, 0), node.adam)
-        node = dataclasses.replace(node, adam=kept)
-        step, adam = self._adam_step(world, goal, q, tree.score[parent], node)
+        alpha = jnp.full(self.lanes, self.alpha)
+        step, adam = adam_step(world, q, node.grad, kept, alpha, self.beta1, self.beta2)
 
-        # Exploration: a step of fixed length towards a random configuration, with fresh moments.
+        # Exploration: a step of random length towards a random configuration, with fresh moments.
+        key_q, key_length = jax.random.split(key_q)
         towards = difference(world, q, sample_configurations(world, key_q, self.lanes))
         norm = jnp.sqrt(jnp.sum(towards**2, axis=-1, keepdims=True))
-        random_step = self.epsilon * towards / jnp.maximum(norm, 1e-9)
+        longest = jnp.maximum(self.rho, self.epsilon)
+        length = jax.random.uniform(
+            key_length, (self.lanes, 1), minval=self.epsilon, maxval=longest
+        )
+        random_step = length * towards / jnp.maximum(norm, 1e-9)
         adam = jax.tree.map(
-            lambda leaf: jnp.where(
-                exploits.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.zeros_like(leaf)
+            lambda leaf, fresh: jnp.where(
+                exploits.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, fresh
             ),
             adam,
+            fresh_moments(*q.shape),
         )
         return Proposals(
             parent=parent,
@@ -161,20 +166,6 @@ class VisualRRT:
         logit = jnp.where(allowed, jnp.log(weight + 1e-30) + noise, -jnp.inf)
         logit, node = jax.lax.top_k(logit, self.lanes)
         return node, logit > -jnp.inf
-
-    def _adam_step(
-        self, world: World, goal: Goal, q: jax.Array, loss: jax.Array, node: VisualNode
-    ) -> tuple[jax.Array, optax.ScaleByAdamState]:
-        """Steps (B, D) down the loss, and the moments after them."""
-        adam = optax.scale_by_adam(b1=self.beta1, b2=self.beta2, eps=1e-8)
-        direction, state = jax.vmap(adam.update)(node.grad, node.adam)
-        anneal_loss = self.anneal * goal.threshold
-        shrink = jnp.sqrt(jnp.minimum(1.0, loss / jnp.maximum(anneal_loss, 1e-12)))
-        step = -self.alpha * shrink[:, None] * jnp.asarray(direction)
-        # Momentum into a limit would only hold the joint there.
-        beyond = (q + step < world.lower) | (q + step > world.upper)
-        stuck = ~world.is_continuous & beyond
-        return step, state._replace(mu=jnp.where(stuck, 0.0, state.mu))
 
     def evaluate(
         self, world: World, goal: Goal, q: jax.Array, proposals: Proposals
@@ -224,9 +215,7 @@ def tree_from_roots(world: World, goal: Goal, q: jax.Array, capacity: int) -> Tr
     """Roots ``q`` (R, D), the start first; those in collision are never expanded."""
     score, grad = _losses_and_gradients(world, goal, q)
     blocked = ~jax.vmap(world.is_free)(q)
-    moments = optax.ScaleByAdamState(
-        count=jnp.zeros(len(q), jnp.int32), mu=jnp.zeros_like(q), nu=jnp.zeros_like(q)
-    )
+    moments = fresh_moments(*q.shape)
     score = jnp.where(blocked, jnp.finfo(score.dtype).max, score)
     payload = VisualNode(grad=grad, adam=moments, exploited=blocked)
     return trees.create(q, score, payload, capacity, trees.root_costs(len(q)))

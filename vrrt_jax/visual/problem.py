@@ -13,15 +13,13 @@ from vrrt_jax.core.types import Goal
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.visual.goal import ImageGoal
 from vrrt_jax.visual.polish import Polishing, PriorGoal
-from vrrt_jax.visual.seeds import SeedSampling
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class VisualProblem:
-    """The goal of the search, of the seeds before it, and of the polishing after it."""
+    """The goal of the search, and of the polishing after it."""
 
     goal: Goal
-    seeds: SeedSampling
     polishing: Polishing | None  # None where nothing is to be polished
 
 
@@ -49,26 +47,25 @@ def make_problem(
         scale = config.match.scale
         search_goal: Any = goal.at(robot, config.tree.image_px, scale)
         checks.check_cameras(robot, search_goal.splats, search_goal.cameras, q_start)
-        seed_goal = goal.at(robot, config.seeds.px, scale)
-        fine_goal = search_goal
+        coarse_goal = fine_goal = search_goal
         if config.polish.hypotheses:
+            coarse_goal = goal.at(robot, config.polish.coarse_px, scale)
             fine_goal = goal.at(robot, config.polish.px, scale)
             if config.polish.close_px:
                 close_up = goal.close_up(config.polish.close_px, scale)
         has_residuals = True
     else:
-        search_goal = seed_goal = fine_goal = goal
+        search_goal = coarse_goal = fine_goal = goal
         has_residuals = isinstance(goal, LeastSquaresGoal)
     polishing = None
     if config.polish.hypotheses and has_residuals:
         polishing = Polishing(
-            coarse=_with_prior(search_goal, q_start, config),
+            coarse=_with_prior(coarse_goal, q_start, config),
             fine=_with_prior(fine_goal, q_start, config),
             close_up=close_up,
             config=config.polish,
         )
-    seeds = SeedSampling.from_config(seed_goal, config)
-    return VisualProblem(goal=search_goal, seeds=seeds, polishing=polishing)
+    return VisualProblem(goal=search_goal, polishing=polishing)
 
 
 def _with_prior(goal: Any, q_start: np.ndarray, config: PlannerConfig) -> PriorGoal:

@@ -75,6 +75,39 @@ class RRTConnect:
         far = np.full(2, np.finfo(np.float32).max)
         return trees.create(q, far, ConnectNode(**ends), capacity)
 
+    def init_from(
+        self, world: Space, goal: ConfigurationGoal, tree: Tree, capacity: int
+    ) -> Tree[ConnectNode]:
+        """The same, but what another planner has grown from the start is in it; on the host.
+
+        Args:
+            world: robot and obstacles.
+            goal: where to.
+            tree: its node 0 is the start. Nodes that no path leads to from there are left out; the
+                others stay in order, one slot farther back than without them.
+            capacity: number of slots, more than the tree has nodes.
+        """
+        cost, parent, q = (np.asarray(leaf) for leaf in (tree.cost, tree.parent, tree.q))
+        kept = np.flatnonzero(cost[: int(tree.size)] < trees.UNREACHED)[1:]
+        num = len(kept) + 2
+        slot = np.zeros(len(q), np.int32)
+        slot[kept] = np.arange(2, num)
+
+        ends = self.init(world, goal, q[:1], capacity)
+        columns = {name: np.array(getattr(ends, name)) for name in ("q", "parent", "cost", "score")}
+        columns["q"][2:num] = q[kept]
+        columns["parent"][2:num] = slot[parent[kept]]
+        columns["cost"][2:num] = cost[kept]
+        columns["score"][2:num] = columns["score"][0]
+        meets = np.array(ends.payload.meets)
+        meets[2:num] = -1
+        return dataclasses.replace(
+            ends,
+            **{name: jnp.asarray(column) for name, column in columns.items()},
+            size=jnp.int32(num),
+            payload=dataclasses.replace(ends.payload, meets=jnp.asarray(meets)),
+        )
+
     def goal_score(self, goal: ConfigurationGoal) -> float:
         """0, which only a node has where the trees meet."""
         return 0.0
@@ -162,12 +195,18 @@ class RRTConnect:
 
     def extract_path(self, tree: Tree[ConnectNode]) -> np.ndarray | None:
         """The path (P, D) from start to goal through the place where the trees met, if they did."""
+        halves = self.halves(tree)
+        if halves is None:
+            return None
+        # Both halves end where the trees met: one of the nodes is left out.
+        return np.asarray(tree.q)[np.concatenate([halves[0], halves[1][::-1][1:]])]
+
+    def halves(self, tree: Tree[ConnectNode]) -> tuple[np.ndarray, np.ndarray] | None:
+        """Nodes from the start, and from the goal, to where the trees met; None if they did not."""
         best = int(np.argmin(tree.score))
         other = int(tree.payload.meets[best])
         if other < 0:
             return None
-        halves = [trees.branch_path(tree, best), trees.branch_path(tree, other)]
         if int(tree.payload.side[best]) == 1:
-            halves.reverse()
-        # Both nodes stand where the trees met: one of them is left out.
-        return np.concatenate([halves[0], halves[1][::-1][1:]])
+            best, other = other, best
+        return trees.lineage(tree, best), trees.lineage(tree, other)
