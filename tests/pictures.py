@@ -12,7 +12,7 @@ HALF_TURNED = Q_GOAL - np.pi * np.eye(7, dtype=np.float32)[6]
 # Of the default's shapes, and seen by a packaged problem's camera: most programs compile once for
 # all tests that plan.
 QUICK = vrrt_jax.PlannerConfig().changed(
-    {"seeds.rounds": 1, "seeds.steps": 20, "budget.max_iterations": 150}
+    {"lineages.samples": 512, "lineages.jumps": 16, "lineages.steps": 30, "lineages.young": 10}
 )
 
 

@@ -56,9 +56,9 @@ def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
     run(image=picture(panda, self_model, camera, Q_GOAL + 0.1), changes=few)
     run(q_start=Q_START + 0.1, changes=few)
     run(model=lighter, changes=few)
-    expand = {"alpha": 0.02, "epsilon": 0.1, "kappa": 0.5, "eta": 0.3, "exploration": 0.5}
-    run(changes=few | {f"expand.{name}": value for name, value in expand.items()})
-    run(changes=few | {"expand.beta1": 0.5, "expand.inherit": False})
+    own = {"radius": 1.0, "samples": 64, "jumps": 1, "steps": 3, "young": 1, "alpha": 0.02}
+    run(changes=few | {f"lineages.{name}": value for name, value in own.items()})
+    run(changes=few | {"expand.beta1": 0.5, "expand.beta2": 0.5})
     assert searches._chunk._cache_size() == before
 
 
@@ -153,7 +153,7 @@ def test_another_attempt_while_nothing_matches(
 
 
 def test_a_guess_becomes_a_root(panda, self_model, camera, image, open_world):
-    config = QUICK.changed({"seeds.num": 0, "budget.max_iterations": 3, "polish.hypotheses": 0})
+    config = QUICK.changed({"budget.max_iterations": 3, "polish.hypotheses": 0})
     args = (panda, open_world, self_model, camera, image, Q_START)
     told = vrrt_jax.plan(*args, key=jax.random.key(0), config=config, q_guess=Q_GOAL + 0.05)
     np.testing.assert_allclose(told.tree.q[1], Q_GOAL + 0.05, atol=1e-6)
@@ -273,7 +273,7 @@ def test_the_score_of_a_planner_is_not_believed_as_a_loss(panda, open_world):
     place = vrrt_jax.link_poses(panda.chain, jnp.asarray(Q_GOAL))[-1, :3, 3]
     goal = HandGoal(place=place)
     config = QUICK.changed(
-        {"polish.hypotheses": 0, "budget.max_iterations": 2, "budget.attempts": 1, "seeds.num": 0}
+        {"polish.hypotheses": 0, "budget.max_iterations": 2, "budget.attempts": 1}
     )
     result = vrrt_jax.plan(
         panda,

@@ -99,5 +99,5 @@ def test_steps_are_as_long_in_a_world_with_finer_checks(panda, wall_world):
         assert planner.for_world(finer).edge_steps == 3 * planner().edge_steps
     config = vrrt_jax.PlannerConfig()
     coarse, fine = (vrrt_jax.VisualRRT.from_config(config, w) for w in (wall_world, finer))
-    assert (coarse.edge_steps, coarse.rewire_steps) == (6, 15)
-    assert (fine.edge_steps, fine.rewire_steps) == (18, 45)
+    assert (coarse.edge_steps, coarse.rewire_steps) == (35, 15)
+    assert (fine.edge_steps, fine.rewire_steps) == (105, 45)

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from vrrt_jax import Budget, PlannerConfig, SeedConfig, TreeConfig
+from vrrt_jax import Budget, LineageConfig, PlannerConfig, TreeConfig
 from vrrt_jax.config import check_config
 
 
@@ -14,8 +14,11 @@ from vrrt_jax.config import check_config
         (PlannerConfig(tree=TreeConfig(lanes=1)), r"tree.lanes=1 is out of range; .* \[2, 4096\]"),
         (PlannerConfig().changed({"expand.kappa": 1.0}), r"expand.kappa=1.0 .* \[0.0, 1.0\)"),
         (PlannerConfig(budget=Budget(time_limit_s=float("nan"))), "budget.time_limit_s=nan"),
-        (PlannerConfig(seeds=SeedConfig(num=None)), "seeds.num=None; expected a whole number"),
-        (PlannerConfig(tree=TreeConfig(capacity=64)), "tree.capacity=64 leaves no room"),
+        (
+            PlannerConfig(lineages=LineageConfig(num=None)),
+            "lineages.num=None; expected a whole number",
+        ),
+        (PlannerConfig(tree=TreeConfig(capacity=33)), "tree.capacity=33 leaves no room"),
     ],
 )
 def test_settings_out_of_range_are_named(config, message):
@@ -29,14 +32,14 @@ def test_none_is_allowed_where_it_means_no_limit():
 
 
 def test_changes_go_to_their_stage_and_unknown_names_are_told():
-    config = PlannerConfig().changed({"seeds.num": 256, "budget.attempts": 1})
-    assert config == PlannerConfig(seeds=SeedConfig(num=256), budget=Budget(attempts=1))
-    with pytest.raises(ValueError, match="unknown setting 'probes'; have: tree, expand, seeds"):
+    config = PlannerConfig().changed({"lineages.num": 256, "budget.attempts": 1})
+    assert config == PlannerConfig(lineages=LineageConfig(num=256), budget=Budget(attempts=1))
+    with pytest.raises(ValueError, match="unknown setting 'probes'; have: tree, lineages, expand"):
         PlannerConfig().changed({"probes": 256})
     with pytest.raises(
-        ValueError, match="unknown setting .seeds.probes.; have: seeds.num, seeds.radius"
+        ValueError, match="unknown setting .lineages.probes.; have: lineages.num, lineages.radius"
     ):
-        PlannerConfig().changed({"seeds.probes": 256})
+        PlannerConfig().changed({"lineages.probes": 256})
 
 
 def test_every_number_has_a_range():

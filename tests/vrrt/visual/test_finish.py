@@ -1,4 +1,4 @@
-"""From the ends of a search to a result: rivals, straight paths, matches without a way."""
+"""From the ends of a search to a result: rivals, and matches without a way."""
 
 import dataclasses
 import types
@@ -13,9 +13,9 @@ from pictures import HALF_TURNED, Q_GOAL, Q_START, picture
 import vrrt_jax
 from vrrt_jax import ImageGoal, PlannerConfig, VisualRRT
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import free_prefix
 from vrrt_jax.core.search import SearchResult, StopReason
 from vrrt_jax.visual import finish
+from vrrt_jax.visual.join import join
 from vrrt_jax.visual.polish import Polished
 from vrrt_jax.visual.problem import make_problem
 
@@ -51,42 +51,9 @@ def test_ambiguous_goals_are_told(panda, self_model, camera, open_world):
     assert f"ambiguous: {len(apart)} other" in str(result)
 
 
-SLIDER = """
-<mujoco>
-  <worldbody>
-    <body>
-      <joint name="slide" type="slide" axis="1 0 0" range="-1 1"/>
-      <geom type="box" size="0.1 0.1 0.1"/>
-    </body>
-  </worldbody>
-</mujoco>
-"""
-
-
-@pytest.fixture(scope="module")
-def slider(tmp_path_factory):
-    path = tmp_path_factory.mktemp("robots") / "slider.xml"
-    path.write_text(SLIDER)
-    return vrrt_jax.load_robot(path)
-
-
 def beside(y):
     """A box that leaves ``y`` - 0.15 m to the slider that passes it."""
     return vrrt_jax.Obstacle(name="box", kind="box", position=(0, y, 0), size=(0.05, 0.05, 0.05))
-
-
-@pytest.mark.parametrize("margin, granted", [(0.0, True), (0.001, False)])
-def test_a_straight_way_that_only_the_spheres_refuse(slider, margin, granted):
-    world = vrrt_jax.build_world(slider, [beside(0.1525)], engine="closed_form", margin=margin)
-    ends = np.array([[-0.5], [0.5]], np.float32)
-    edge = world.edge(jnp.asarray(ends[:1]), jnp.asarray(ends[1:]))
-    steps = int(free_prefix(world, jnp.asarray(ends[:1]), edge, 64)[0])
-    assert 0 < steps < 64
-    found = finished(trees.create(jnp.asarray(ends), jnp.zeros(2), None, 8))
-    _, way = finish._straight(slider, world, found, *ends)
-    assert (way is not None) == granted
-    if granted:
-        np.testing.assert_array_equal(way, ends)
 
 
 class NoPassage(vrrt_jax.ClosedFormWorld):
@@ -96,14 +63,16 @@ class NoPassage(vrrt_jax.ClosedFormWorld):
         return super().is_free(q) & (jnp.abs(q[0]) > 0.05)
 
 
-def test_a_straight_path_obeys_an_is_free_of_ones_own(slider):
+def test_a_way_obeys_an_is_free_of_ones_own(slider):
     world = vrrt_jax.build_world(slider, [], engine="closed_form")
     ends = np.array([[-0.5], [0.5]], np.float32)
-    found = finished(trees.create(jnp.asarray(ends), jnp.zeros(2), None, 8))
-    assert finish._straight(slider, world, found, *ends)[1] is not None
+    found = finished(trees.create(jnp.asarray(ends[:1]), jnp.zeros(1), None, 8))
+    few = PlannerConfig().changed({"tree.lanes": 4, "budget.connect_iterations": 5})
+    key = jax.random.key(0)
+    assert join(world, found, ends[1], key, few)[1] is not None
     fields = {field.name: getattr(world, field.name) for field in dataclasses.fields(world)}
     zone = NoPassage(**fields)
-    assert finish._straight(slider, zone, found, *ends)[1] is None
+    assert join(zone, found, ends[1], key, few)[1] is None
     with pytest.raises(ValueError, match="the start is refused by NoPassage.is_free"):
         vrrt_jax.plan_to_configuration(slider, zone, [0.0], [0.5], key=jax.random.key(0))
 
@@ -111,17 +80,17 @@ def test_a_straight_path_obeys_an_is_free_of_ones_own(slider):
 def test_a_match_without_a_way_is_told(slider, monkeypatch):
     """What can be reached but does not match is no substitute for it."""
     world = vrrt_jax.build_world(slider, [beside(0.1)], engine="closed_form")
+    start = np.array([-0.5], np.float32)
     q = np.array([[-0.4], [0.5]], np.float32)
     losses = np.array([2.0, 0.5])
     polished = Polished(q=q, loss=losses, cost=losses)
     monkeypatch.setattr(finish, "polish", lambda *_: polished)
-    found = finished(trees.create(jnp.asarray(q), jnp.ones(2), None, 8))
+    found = finished(trees.create(jnp.asarray(start[None]), jnp.ones(1), None, 8))
     config = PlannerConfig().changed(
         {"tree.lanes": 4, "tree.capacity": 64, "budget.connect_iterations": 5}
     )
     goal = types.SimpleNamespace(threshold=1.0)
     problem: Any = types.SimpleNamespace(goal=goal, polishing=goal)
-    start = np.array([-0.5], np.float32)
     args = (slider, world, problem, VisualRRT(), found, start, jax.random.key(0), config)
     result = finish.finish_visual(*args)
     assert result.status is vrrt_jax.Status.NO_PATH and result.target == q[1]

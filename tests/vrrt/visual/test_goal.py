@@ -48,7 +48,7 @@ class HalfLoss(ImageObjective):
         return 0.5 * super().loss(world, q)
 
 
-def test_a_loss_of_ones_own_reaches_search_seeds_polishing_and_match(
+def test_a_loss_of_ones_own_reaches_search_polishing_and_match(
     panda, self_model, camera, image, open_world
 ):
     q = jnp.asarray(Q_START)
@@ -60,7 +60,6 @@ def test_a_loss_of_ones_own_reaches_search_seeds_polishing_and_match(
         assert polishing is not None and polishing.close_up is not None
         stages = (
             problem.goal,
-            problem.seeds.goal,
             polishing.coarse.goal,
             polishing.fine.goal,
             polishing.close_up.objective,

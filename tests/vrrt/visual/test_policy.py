@@ -1,4 +1,4 @@
-"""Visual-RRT on the kernel: the frontier's law, Adam along a lineage, exploration, costs."""
+"""The published Visual-RRT on the kernel: the frontier's law, Adam, exploration, costs."""
 
 import dataclasses
 
@@ -7,16 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from pictures import Q_START, QUICK
+from pictures import Q_START
 
-from vrrt_jax import ImageGoal, VisualRRT
+from vrrt_jax import ImageGoal, PlannerConfig, VisualRRT
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.rewire import with_costs
 from vrrt_jax.core.tree import lineage
 
 pytestmark = pytest.mark.light_compilation
 
-CONFIG = QUICK.changed({"seeds.num": 0})
+CONFIG = PlannerConfig.paper()
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,6 @@ def test_a_branch_without_exploration_is_plain_adam(goal, open_world):
         exploration=0.0,
         kappa=0.0,
         eta=1.0,
-        anneal=0.0,
         rewiring=False,
     )
     adam = optax.scale_by_adam(b1=0.9, b2=0.9)
@@ -88,14 +87,15 @@ def test_a_branch_without_exploration_is_plain_adam(goal, open_world):
     assert len(nodes) >= 4
 
 
-def test_explored_children_start_fresh_and_step_epsilon(goal, open_world):
-    tree = grown(open_world, goal, 4, exploration=1.0, rewiring=False)
+@pytest.mark.parametrize("rho, longest, median", [(0.7, 0.7, 0.37), (0.0, 0.04, 0.04)])
+def test_explored_children_start_fresh_and_step_up_to_rho(goal, open_world, rho, longest, median):
+    tree = grown(open_world, goal, 4, exploration=1.0, rho=rho, rewiring=False)
     size = int(tree.size)
-    assert size == 1 + 4 * QUICK.tree.lanes
+    assert size > 1 + 3 * CONFIG.tree.lanes
     assert np.all(np.asarray(tree.payload.adam.count[:size]) == 0)
     assert np.all(np.asarray(tree.payload.adam.mu[:size]) == 0)
     step = np.linalg.norm(tree.q[1:size] - tree.q[tree.parent[1:size]], axis=1)
-    assert np.all(step < 0.04 + 1e-5) and np.median(step) > 0.0399
+    assert np.all(step < longest + 1e-5) and abs(np.median(step) - median) < 0.2 * median
     assert not np.any(tree.payload.exploited)
 
 
