@@ -118,16 +118,17 @@ class LineageRRT:
         direction = jax.random.normal(key_direction, (self.lanes, tree.q.shape[1]))
         direction /= jnp.linalg.norm(direction, axis=1, keepdims=True)
         distance = self.radius * jax.random.uniform(key_distance, (self.lanes, 1))
-        none = jnp.full(self.lanes, -1)
+        start = jnp.zeros(self.lanes, jnp.int32)
         every = jnp.ones(self.lanes, bool)
-        return self._proposals(none * 0, tree.q[0] + distance * direction, every, none)
+        lineage = self._in_turn(tree.iteration)
+        return self._proposals(start, tree.q[0] + distance * direction, every, lineage)
 
     def _jump(self, world: World, goal: Goal, tree: Tree[LineageNode], key: jax.Array) -> Proposals:
         """From the best node of each lineage in turn; some joints move, by ever less."""
         begin, end = self.stages[:2]
         best, exists, _ = self._best(tree)
         turn = tree.iteration - begin
-        lineage = (turn * self.lanes + jnp.arange(self.lanes)) % self.num
+        lineage = self._in_turn(turn)
         parent = best[lineage]
 
         key_step, key_share, key_moved = jax.random.split(key, 3)
@@ -170,6 +171,10 @@ class LineageRRT:
         alpha = self.alpha * (1.0 - adam.count / self.steps)
         step, adam = adam_step(world, q, grad, adam, alpha, self.beta1, self.beta2)
         return self._proposals(parent, q + step, valid, lineage, adam)
+
+    def _in_turn(self, turn: jax.Array) -> jax.Array:
+        """The lineages (B,) that the lanes serve in an iteration, if all of them take turns."""
+        return (turn * self.lanes + jnp.arange(self.lanes)) % self.num
 
     def _label(self, tree: Tree[LineageNode]) -> jax.Array:
         """The lineage (N,) of each node, L for those without one."""
@@ -236,16 +241,7 @@ class LineageRRT:
         taken = jnp.where(stepped, proposals.parent, tree.capacity)
         exploited = tree.payload.exploited.at[taken].set(True, mode="drop")
         payload = dataclasses.replace(tree.payload, exploited=exploited)
-        tree = dataclasses.replace(tree, payload=payload)
-        return jax.lax.cond(tree.iteration == self.stages[0], self._founded, lambda t: t, tree)
-
-    def _founded(self, tree: Tree[LineageNode]) -> Tree[LineageNode]:
-        """The best nodes found a lineage each."""
-        score, head = jax.lax.top_k(-tree.score, min(self.num, tree.capacity))
-        head = jnp.where(score > -jnp.finfo(score.dtype).max, head, tree.capacity)
-        number = jnp.arange(len(head), dtype=jnp.int32)
-        lineage = tree.payload.lineage.at[head].set(number, mode="drop")
-        return dataclasses.replace(tree, payload=dataclasses.replace(tree.payload, lineage=lineage))
+        return dataclasses.replace(tree, payload=payload)
 
     def extract_path(self, tree: Tree[LineageNode]) -> np.ndarray | None:
         """The path (P, D) to the best node, if tree edges join it to the start."""
