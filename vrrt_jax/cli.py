@@ -140,8 +140,8 @@ def _pictures(problem, result, out: Path) -> None:
 def _problem(arguments: argparse.Namespace):
     from vrrt_jax import problems
     from vrrt_jax.robots import load_robot
-    from vrrt_jax.splat.images import read_image
     from vrrt_jax.splat.model import load_self_model
+    from vrrt_jax.splat.picture_file import read_image
 
     parts = ("robot", "world", "goal", "camera", "start")
     given = [name for name in parts if getattr(arguments, name) is not None]
@@ -183,8 +183,8 @@ def _render(arguments: argparse.Namespace) -> int:
 
     from vrrt_jax import checks, problems
     from vrrt_jax.robots import load_robot
-    from vrrt_jax.splat.images import write_image
     from vrrt_jax.splat.mujoco_images import MeshRenderer
+    from vrrt_jax.splat.picture_file import write_image
 
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
     width, height = arguments.size

@@ -87,15 +87,17 @@ def finish(
             key=key,
             rounds=config.budget.shortcut_rounds,
         )
+    # The first thing that failed: without time nothing else is for certain, and without a match a
+    # path is not missed.
     matched = chosen.loss <= chosen.threshold
     if matched and done.is_verified:
         status = Status.SOLVED
     elif found.stopped in EARLY_STOPS:
         status = STATUS_OF[found.stopped]
-    elif chosen.path is None:
-        status = Status.NO_PATH
     elif not matched:
         status = STATUS_OF.get(found.stopped, Status.NO_MATCH)
+    elif chosen.path is None:
+        status = Status.NO_PATH
     else:
         status = Status.NOT_VERIFIED
     result = plan_result(

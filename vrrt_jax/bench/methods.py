@@ -11,6 +11,7 @@ import numpy as np
 
 from vrrt_jax import planner
 from vrrt_jax.bench import baselines
+from vrrt_jax.bench.pose_ambiguity import looks_the_same
 from vrrt_jax.bench.tasks import (
     Scenery,
     Task,
@@ -61,7 +62,7 @@ class Attempt:
 
     path: np.ndarray  # (P, D)
     matched: bool  # the image of its end is below the match threshold
-    has_path: bool  # False if a goal was found, but no way to it
+    has_path: bool  # False if no way to its end was found
     out_of_time: bool
     loss: float
     search_s: float  # planning, without compilation
@@ -115,14 +116,15 @@ def solve(
     right = bool(error.mean() < SUCCESS_RAD)
     valid = not collisions or verify_path(robot, obstacle_list(world), attempt.path).ok
     success = right and valid and (attempt.has_path or not collisions)
-    psnr_db = image_psnr(robot_name, attempt.path[-1], images, scenery)
+    psnr_db = image_psnr(robot_name, attempt.path[-1], images, scenery, masks)
     length = path_length(world, attempt.path)
     reference, cause = None, ""
     if collisions and right and (valid or not attempt.has_path):
         reference = _reference_length(robot, world, task, key)
     if not success:
-        # The meshes look more alike in the two poses than the self-model is like the meshes.
-        alike = psnr_db >= self_model.level_for(config.polish.px).psnr_db
+        alike = not right and looks_the_same(
+            robot_name, task, attempt.path[-1], self_model, scenery, config.polish.px
+        )
         known = reference is not None or not collisions
         cause = _cause(attempt, right=right, valid=valid, alike=alike, known=known)
     return {
@@ -164,11 +166,11 @@ def _cause(attempt: Attempt, *, right: bool, valid: bool, alike: bool, known: bo
 
 def _plan(inputs, key, config: PlannerConfig, masks, guess) -> Attempt:
     result = planner.plan(*inputs, key=key, config=config, mask=masks, q_guess=guess)
-    times = result.timing
+    times, has_path = result.timing, result.verification is not None
     return Attempt(
-        path=result.path if result.status is not Status.NO_PATH else result.target[None],
+        path=result.path if has_path else result.target[None],
         matched=result.loss <= result.match_threshold,
-        has_path=result.status is not Status.NO_PATH,
+        has_path=has_path,
         out_of_time=result.status is Status.TIME_LIMIT,
         loss=result.loss,
         search_s=times["search_s"] + times["shortcut_s"] + times["verify_s"],

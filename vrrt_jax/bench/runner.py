@@ -21,7 +21,7 @@ from vrrt_jax.core.timing import machine
 from vrrt_jax.problems import self_model_path
 from vrrt_jax.report import versions
 
-FORMAT = 2
+FORMAT = 3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ from vrrt_jax.core.edges import free_prefix
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners import RRTConnect
 from vrrt_jax.core.result import EARLY_STOPS, PlanResult, Status, with_time_of
-from vrrt_jax.core.search import SearchResult, make_termination, search
+from vrrt_jax.core.search import SearchResult, StopReason, make_termination, search
 from vrrt_jax.core.timing import timed
 from vrrt_jax.core.types import ExpansionPolicy
 from vrrt_jax.outcome import Chosen, finish, time_left
@@ -73,6 +73,7 @@ def finish_visual(
     """
     search_threshold = float(problem.goal.threshold)
     found, ends = _choose_ends(world, problem, policy, found, q_start, key, config)
+    stopped = found.stopped
 
     # Try the ends in turn: by the tree's own path, straight, or by RRT-Connect.
     path, end = None, ends.order[0]
@@ -88,6 +89,9 @@ def finish_visual(
         if path is not None or found.stopped in EARLY_STOPS:
             break
     target, loss = ends.q[end], float(ends.loss[end])
+    if loss > ends.threshold and found.stopped is StopReason.TIME_LIMIT:
+        # The match was missed before the time was up on the way to what is none.
+        found = dataclasses.replace(found, stopped=stopped)
     chosen = Chosen(path=path, target=target, loss=loss, threshold=ends.threshold)
     result = finish(robot, world, found, chosen, q_start, key, config)
 
@@ -178,7 +182,7 @@ def _polished_ends(
         q=polished.q,
         loss=polished.loss,
         cost=polished.cost,
-        order=matched or rivals or [0],
+        order=matched or rivals or [int(np.argmin(polished.loss))],  # the last: all collide
         rivals=rivals,
         paths={},
         threshold=threshold,
