@@ -84,7 +84,8 @@ def _without_bleeding(
     )
     if not inside.any():
         return image, is_robot
-    distance, nearest = ndimage.distance_transform_edt(~inside, return_indices=True)
+    nearest = np.zeros((2, *inside.shape), np.int32)
+    distance = ndimage.distance_transform_edt(~inside, return_indices=True, indices=nearest)
     own = image[nearest[0], nearest[1]] - color
     length2 = np.maximum(np.sum(own**2, axis=-1), 1e-6)
     share = np.sum((image - color) * own, axis=-1) / length2
@@ -102,18 +103,24 @@ def _without_specks(is_robot: np.ndarray, apart: np.ndarray, spread: float) -> n
     passes through that color.
     """
     speck = SPECK * is_robot.size
-    holes, num = ndimage.label(~is_robot)
+    holes, num = _patches(~is_robot)
     index = np.arange(num + 1)
     size = np.bincount(holes.ravel(), minlength=num + 1)
-    typical = ndimage.median(apart, holes, index)
+    typical = np.asarray(ndimage.median(apart, holes, index))
     is_filled = (size <= speck) | (typical > max(MIN_TOLERANCE, OF_SPREAD * spread))
     is_filled[np.unique(_border(holes))] = False  # open to the outside
     is_filled[0] = False  # the robot
     is_robot = is_robot | is_filled[holes]
-    patches, num = ndimage.label(is_robot)
+    patches, num = _patches(is_robot)
     is_kept = np.bincount(patches.ravel(), minlength=num + 1) > speck
     is_kept[0] = False  # the background
     return is_kept[patches]
+
+
+def _patches(mask: np.ndarray) -> tuple[np.ndarray, int]:
+    """Numbers (H, W) of the connected patches of a mask, 0 outside of all, and how many."""
+    numbers = np.zeros(mask.shape, np.int32)
+    return numbers, int(ndimage.label(mask, output=numbers))
 
 
 def _check_covered(is_robot: np.ndarray) -> None:

@@ -107,7 +107,7 @@ def camera_from_matrix(
         )
     middle = [width / 2, height / 2]
     point = _vector(middle if principal_point is None else principal_point, 2, "centre")
-    if np.all(np.abs(point) <= 1):
+    if principal_point is not None and np.all(np.abs(point) <= 1):
         raise ValueError(
             f"the principal point (centre) is {point.tolist()}; expected pixels, about "
             f"{middle} in the middle of the image"

@@ -25,17 +25,7 @@ ADVICE = {
     **dict.fromkeys(("fx", "fy", "focal_length"), _FOCAL),
     **dict.fromkeys(("k", "intrinsics", "camera_matrix"), f"{_FOCAL}, and {_CENTRE[5:]}"),
     **dict.fromkeys(
-        (
-            "distortion",
-            "d",
-            "dist",
-            "dist_coeffs",
-            "distortion_coefficients",
-            "k1",
-            "k2",
-            "p1",
-            "p2",
-        ),
+        ("distortion", "d", "dist", "dist_coeffs", "distortion_coefficients", "k1", "k2"),
         _UNDISTORT,
     ),
     **dict.fromkeys(

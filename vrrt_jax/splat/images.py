@@ -64,17 +64,18 @@ def check_views(
             f"got {len(masks)} masks for {len(images)} goal images; give a list with one, or None, "
             "for each"
         )
-    views = []
+    views, alphas, valids = [], [], []
     for image, camera, mask in zip(images, cameras, masks, strict=True):
         rgb, alpha = _check_image(image, camera)
         valid = np.ones_like(alpha) if mask is None else valid_mask(mask, *alpha.shape)
+        alphas.append(alpha.ravel())
+        valids.append(valid.ravel())
         planes = np.concatenate([rgb, alpha[..., None], np.ones_like(alpha)[..., None]], axis=-1)
         planes, camera = _square_pixels(planes * valid[..., None], camera)
         views.append(
             View(rgb=planes[..., :3], alpha=planes[..., 3], valid=planes[..., 4], camera=camera)
         )
-    if any(mask is not None for mask in masks):
-        _check_masks(views)
+    _check_masks(np.concatenate(alphas), np.concatenate(valids))
     shapes = {view.alpha.shape for view in views}
     if len(shapes) > 1:
         raise ValueError(f"the views have sizes {sorted(shapes)}; make them all one size")
@@ -183,18 +184,16 @@ def _check_alpha(alpha: np.ndarray) -> None:
         )
 
 
-def _check_masks(views: Sequence[View]) -> None:
-    """Raise a ValueError if the masks of views hide the robot, or all but the robot."""
-    valid = np.sum([view.valid.sum() for view in views])
-    robot = np.sum([view.alpha.sum() for view in views])
-    seen = np.sum([np.sum(view.valid * view.alpha) for view in views])
-    if seen < MIN_SEEN * robot:
-        left = f"only {100 * seen / robot:.1f} %" if seen else "nothing"
+def _check_masks(alpha: np.ndarray, valid: np.ndarray) -> None:
+    """Raise a ValueError if the masks (n,) of all views hide the robot, or all but the robot."""
+    seen = np.sum(valid * alpha)
+    if seen < MIN_SEEN * alpha.sum():
+        left = f"only {100 * seen / alpha.sum():.1f} %" if seen else "nothing"
         raise ValueError(
             f"the masks leave {left} of the robot; True marks the pixels to compare: are they "
             "inverted?"
         )
-    if valid - seen < MIN_AROUND * valid:
+    if valid.sum() - seen < MIN_AROUND * valid.sum():
         raise ValueError(
             "the masks leave nothing but the robot, so that nothing says where it ends; True marks "
             "the pixels to compare, background too: give the robot's own mask as fourth channel of "

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 MIN_BITS_USED = 0.25  # largest value of a picture of 16 bits, as a share; less is of fewer bits
-MIN_BRIGHTEST = 0.05  # largest value of a picture; less is of another range
+MIN_BRIGHTEST = 0.1  # largest value of a picture; less is of another range
 MIN_ON_ROBOT = 0.5  # largest value of the robot's mask
 
 
