@@ -85,7 +85,10 @@ def _without_bleeding(
     if not inside.any():
         return image, is_robot
     nearest = np.zeros((2, *inside.shape), np.int32)
-    distance = ndimage.distance_transform_edt(~inside, return_indices=True, indices=nearest)
+    distance = np.zeros(inside.shape)
+    ndimage.distance_transform_edt(
+        ~inside, return_indices=True, distances=distance, indices=nearest
+    )
     own = image[nearest[0], nearest[1]] - color
     length2 = np.maximum(np.sum(own**2, axis=-1), 1e-6)
     share = np.sum((image - color) * own, axis=-1) / length2
@@ -120,7 +123,8 @@ def _without_specks(is_robot: np.ndarray, apart: np.ndarray, spread: float) -> n
 def _patches(mask: np.ndarray) -> tuple[np.ndarray, int]:
     """Numbers (H, W) of the connected patches of a mask, 0 outside of all, and how many."""
     numbers = np.zeros(mask.shape, np.int32)
-    return numbers, int(ndimage.label(mask, output=numbers))
+    ndimage.label(mask, output=numbers)
+    return numbers, int(numbers.max())
 
 
 def _check_covered(is_robot: np.ndarray) -> None:

@@ -30,7 +30,7 @@ def test_a_mask_that_hides_the_robot_is_refused(panda, self_model, camera, image
     with pytest.raises(ValueError, match="the masks leave nothing of the robot"):
         ImageGoal(self_model, camera, image, hiding).at(panda, IMAGE_PX)
     scattered = rng.random(image.shape[:2]) < 0.5  # of each shrunk pixel too little is left
-    with pytest.raises(ValueError, match="the masks leave nothing of the robot on images of 64 px"):
+    with pytest.raises(ValueError, match="the masks leave nothing of the robot on images of 60 px"):
         ImageGoal(self_model, camera, image, scattered).at(panda, IMAGE_PX)
 
 
