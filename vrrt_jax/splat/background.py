@@ -79,9 +79,9 @@ def _without_bleeding(
     A mixture lies on the line between the background's color and that of the nearest pixel well
     inside of the robot. It is robot if it is nearer to the robot's color, which it then gets.
     """
-    inside = ndimage.binary_erosion(
-        apart > MAX_TOLERANCE, np.ones((2 * BLEED_PX + 1,) * 2), border_value=1
-    )
+    square = np.ones((2 * BLEED_PX + 1,) * 2)
+    eroded = ndimage.binary_erosion(apart > MAX_TOLERANCE, square, border_value=1)
+    inside = np.asarray(eroded, bool)
     if not inside.any():
         return image, is_robot
     nearest = np.zeros((2, *inside.shape), np.int32)
