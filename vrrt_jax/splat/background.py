@@ -23,11 +23,14 @@ OFF_LINE = 0.35  # how far off the line between two colors their mixtures are, o
 OWN_COLOR = 0.9  # share of its own color from which on a pixel of the robot is not mended
 
 
-def robot_on_plain_background(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def robot_on_plain_background(
+    image: np.ndarray, valid: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Tell the robot from a background of one color, the median of the image's border.
 
     Args:
         image: (H, W, 3) in [0, 1].
+        valid: (H, W) 1 where the image is known, else 0; all of it if None.
 
     Returns:
         The colors (H, W, 3), without what the background bled into them; and alpha (H, W), 0 or 1.
@@ -35,17 +38,21 @@ def robot_on_plain_background(image: np.ndarray) -> tuple[np.ndarray, np.ndarray
     Raises:
         ValueError: the background is not plain, or there is nothing or nothing but robot.
     """
-    color = np.median(_border(image), axis=0)
+    valid = np.ones(image.shape[:2], bool) if valid is None else valid > 0
+    known = _border(valid)
+    if not known.any():
+        known = np.ones_like(known)
+    color = np.median(_border(image)[known], axis=0)
     off = image - color
     apart = np.abs(off).max(axis=-1)
-    spread = float(np.median(_border(apart)))
+    spread = float(np.median(_border(apart)[known]))
     if spread > MAX_SPREAD:
         raise _not_plain(apart > MAX_TOLERANCE)
     is_robot = apart > max(_noise(off, apart), OF_SPREAD * spread)
     if np.ptp(color) > COLORFUL:
         image, is_robot = _without_bleeding(image, color, apart, is_robot)
     is_robot = _without_specks(is_robot, apart, spread)
-    _check_covered(is_robot)
+    _check_covered(is_robot, valid)
     return image, is_robot.astype(np.float32)
 
 
@@ -127,15 +134,16 @@ def _patches(mask: np.ndarray) -> tuple[np.ndarray, int]:
     return numbers, int(numbers.max())
 
 
-def _check_covered(is_robot: np.ndarray) -> None:
-    covered, of_border = is_robot.mean(), _border(is_robot).mean()
-    if covered < MIN_COVERED:
+def _check_covered(is_robot: np.ndarray, valid: np.ndarray) -> None:
+    """Raise a ValueError if there is no robot, or too much where the image is known."""
+    if is_robot.mean() < MIN_COVERED:
         raise ValueError(
             "the goal image is blank: every pixel has the color of the border, or nearly; give an "
             "image that shows the robot"
         )
-    if covered > MAX_COVERED or of_border > MAX_BORDER:
-        raise _not_plain(is_robot)
+    seen = is_robot & valid
+    if seen.mean() > MAX_COVERED or _border(seen).mean() > MAX_BORDER:
+        raise _not_plain(seen)
 
 
 def _not_plain(differs: np.ndarray) -> ValueError:

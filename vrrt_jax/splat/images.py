@@ -66,8 +66,11 @@ def check_views(
         )
     views, alphas, valids = [], [], []
     for image, camera, mask in zip(images, cameras, masks, strict=True):
-        rgb, alpha = _check_image(image, camera)
-        valid = np.ones_like(alpha) if mask is None else valid_mask(mask, *alpha.shape)
+        pixels = _check_size(image, camera)
+        valid = np.ones(pixels.shape[:2], np.float32)
+        if mask is not None:
+            valid = valid_mask(mask, *valid.shape)
+        rgb, alpha = _robot_of(pixels, valid)
         alphas.append(alpha.ravel())
         valids.append(valid.ravel())
         planes = np.concatenate([rgb, alpha[..., None], np.ones_like(alpha)[..., None]], axis=-1)
@@ -145,8 +148,8 @@ def cut_goal(
     return jax.tree.map(parts, goal), cut(cameras, corner, height, width)
 
 
-def _check_image(image: Any, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """The robot over black (H, W, 3), and its alpha (H, W)."""
+def _check_size(image: Any, camera: Camera) -> np.ndarray:
+    """The image (H, W, 3) or (H, W, 4), of the camera's size."""
     image = unit_pixels(image)
     if image.shape[:2] != (camera.height, camera.width):
         raise ValueError(
@@ -159,19 +162,25 @@ def _check_image(image: Any, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
             "px on a side"
         )
     check_brightness(image)
+    return image
+
+
+def _robot_of(image: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The robot over black (H, W, 3), and its alpha (H, W); checked where ``valid`` (H, W) is 1."""
     if image.shape[2] == 4 and image[..., 3].min() < MIN_OPAQUE:
         rgb, alpha = image[..., :3], image[..., 3]
-        _check_alpha(alpha)
+        _check_alpha(alpha, valid)
     else:
-        rgb, alpha = robot_on_plain_background(image[..., :3])
+        rgb, alpha = robot_on_plain_background(image[..., :3], valid)
     return rgb * alpha[..., None], alpha
 
 
-def _check_alpha(alpha: np.ndarray) -> None:
+def _check_alpha(alpha: np.ndarray, valid: np.ndarray) -> None:
     """Raise a ValueError for a mask (H, W) of the robot that can hardly be one."""
-    covered = alpha.mean()
-    of_border = np.mean([row.mean() for row in (alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1])])
-    if covered < MIN_COVERED:
+    seen = alpha * valid
+    covered = seen.mean()
+    of_border = np.mean([row.mean() for row in (seen[0], seen[-1], seen[:, 0], seen[:, -1])])
+    if alpha.mean() < MIN_COVERED:
         raise ValueError(
             "the goal image's mask (its fourth channel) is empty, or nearly: no robot to match; "
             "check that the mask is 1 on the robot"
@@ -187,7 +196,8 @@ def _check_alpha(alpha: np.ndarray) -> None:
 def _check_masks(alpha: np.ndarray, valid: np.ndarray) -> None:
     """Raise a ValueError if the masks (n,) of all views hide the robot, or all but the robot."""
     seen = np.sum(valid * alpha)
-    if seen < MIN_SEEN * alpha.sum():
+    # What is hidden may have any alpha: where most is seen, that says nothing.
+    if not seen or (seen < MIN_SEEN * alpha.sum() and valid.mean() < 0.5):
         left = f"only {100 * seen / alpha.sum():.1f} %" if seen else "nothing"
         raise ValueError(
             f"the masks leave {left} of the robot; True marks the pixels to compare: are they "
