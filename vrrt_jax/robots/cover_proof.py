@@ -12,11 +12,12 @@ from vrrt_jax.robots.widest_sphere import MARGIN, best_sphere
 
 _GROUP = 10  # of the bound: side of the cubes in which a cover is proven
 _BLOCK = 2_000_000  # numbers in memory at once
+_Growing = tuple[np.ndarray, ...]  # centers (n, 3), radii (n,), and (n,) what they may grow to [m]
 
 
 def prove_cover(
     pieces: list[Piece],
-    spheres: tuple[np.ndarray, np.ndarray, np.ndarray],
+    spheres: _Growing,
     bulge: float,
     rng: np.random.Generator,
     most: int,
@@ -70,10 +71,10 @@ def _prove_locally(
     pieces: list[Piece],
     others: list[Piece],
     triangles: np.ndarray,
-    spheres: tuple[np.ndarray, np.ndarray, np.ndarray],
+    spheres: _Growing,
     bulge: float,
     rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> _Growing:
     """Spheres that contain triangles (t, 3, 3), but for those in ``others``."""
     centers, radii, widest = spheres
     stack = [triangles]
@@ -120,7 +121,7 @@ def _grown(
     """
     radii = radii.copy()
     distance = np.where(distance <= widest, distance, np.inf)
-    is_out_of_reach = np.isinf(distance).all(axis=1)
+    is_out_of_reach = np.asarray(np.isinf(distance).all(axis=1))
     distance = distance[~is_out_of_reach]
     while len(distance):
         # What is farthest from all spheres is taken in by the one that it is nearest to.

@@ -17,6 +17,7 @@ the command ``vrrt spheres``.
 """
 
 import warnings
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
@@ -26,6 +27,7 @@ from vrrt_jax.robots.geom_pieces import collision_pieces
 from vrrt_jax.robots.kinematics import BodySpheres
 
 MAX_BULGE = 0.03  # [m] how far spheres stick out of the bodies of a loaded robot at most
+_FINE_BULGE, _FEW_SPHERES = 0.02, 50  # [m] of a body that so many spheres are enough for
 _RELATIVE_BULGE = 0.1  # of the extent of the body, if that is less
 MOST_SPHERES = 2000  # of one body
 _ROUNDING = 1e-6  # a length is divided into n parts if it exceeds n parts by less
@@ -132,13 +134,14 @@ def cover_convex_parts(model: mujoco.MjModel, *, most: int = MOST_SPHERES) -> Bo
     }
     owners, centers, radii = [], [], []
     for body, pieces in pieces_of_bodies.items():
-        found = _own_spheres(model, body)
         # Small bodies get a fine cover, but the smallest must not use up most of the spheres.
-        bulge = max(extents[body], max(extents.values()) / 2) * _RELATIVE_BULGE
-        bulge = min(bulge, MAX_BULGE)
-        while found is None:
-            found = cover_within(pieces, bulge, rng, most=most)
-            bulge *= 1 if found else 2
+        fine = max(extents[body], max(extents.values()) / 2) * _RELATIVE_BULGE
+        found, bulge = _own_spheres(model, body), 0.0
+        for wanted, enough in _choices(most):
+            if found is None:
+                bulge = min(wanted, fine) if wanted <= MAX_BULGE else wanted
+                found = cover_within(pieces, bulge, rng, most=enough)
+        assert found is not None  # as the coarsest spheres are larger than any robot
         if bulge > MAX_BULGE and most == MOST_SPHERES:
             warnings.warn(
                 f"body '{model.body(body).name}' is so large that {most} spheres, the most for one "
@@ -150,6 +153,15 @@ def cover_convex_parts(model: mujoco.MjModel, *, most: int = MOST_SPHERES) -> Bo
         centers.append(found[0])
         radii.append(found[1])
     return BodySpheres(body=np.hstack(owners), center=np.vstack(centers), radius=np.hstack(radii))
+
+
+def _choices(most: int) -> Iterator[tuple[float, int]]:
+    """How far spheres may stick out [m], and how many there may be: finer ones if few are enough.
+
+    The bulge doubles where ``most`` spheres are not enough for :data:`MAX_BULGE`.
+    """
+    yield _FINE_BULGE, min(most, _FEW_SPHERES)
+    yield from ((MAX_BULGE * 2**k, most) for k in range(20))
 
 
 def _own_spheres(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray] | None:

@@ -6,7 +6,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from vrrt_jax.robots import geom_pieces, load_robot, mesh_sources, robot_fit, sphere_fit
+from vrrt_jax.robots import (
+    convex_parts,
+    geom_pieces,
+    load_robot,
+    mesh_sources,
+    robot_fit,
+    sphere_fit,
+)
 from vrrt_jax.robots.robot_spheres import spheres_of
 from vrrt_jax.scene.sphere_errors import measure_spheres
 

@@ -136,7 +136,9 @@ def test_fine_and_flat_meshes_are_covered(rng):
     ).reshape(-1, 3)
     sheet = rng.uniform(-0.1, 0.1, (30, 3)) * [1, 1, 0]
     for points in (needle, sheet):
-        spheres_center, radius = cover_within([piece_of(solid(points))], 0.03, rng, most=100)
+        found = cover_within([piece_of(solid(points))], 0.03, rng, most=100)
+        assert found is not None
+        spheres_center, radius = found
         gap = np.linalg.norm(points[:, None] - spheres_center, axis=2) - radius
         assert gap.min(axis=1).max() <= 1e-9
         # A sphere's farthest point from the shape is at least so far from the nearest point of it.
