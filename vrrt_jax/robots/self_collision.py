@@ -6,7 +6,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from vrrt_jax.robots.mjcf import joint_ranges
+from vrrt_jax.robots.limits import joint_ranges
 
 _NUM_DRAFT = 500  # configurations in which a draft of spheres is checked
 _ALWAYS = 0.98  # a pair of bodies that touches in a larger share of configurations is ignored
