@@ -1,7 +1,6 @@
 """Read any MJCF or URDF robot and reduce it to what planning needs."""
 
 import warnings
-from collections.abc import Collection
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -9,6 +8,7 @@ import mujoco
 import numpy as np
 
 from vrrt_jax.robots import urdf
+from vrrt_jax.robots.names import free_name
 
 _TOOL = "tool_"  # two models may use a name twice
 _WRAPS_JOINT = mujoco.mjtWrap.mjWRAP_JOINT
@@ -159,13 +159,6 @@ def collide_visuals(spec: mujoco.MjSpec) -> None:
             geom.contype = geom.conaffinity = 1
         else:
             spec.delete(geom)
-
-
-def free_name(wanted: str, taken: Collection[str]) -> str:
-    """``wanted``, with underscores behind it until nothing else has that name."""
-    while wanted in taken:
-        wanted += "_"
-    return wanted
 
 
 def warn_of_what_is_lost(spec: mujoco.MjSpec) -> None:

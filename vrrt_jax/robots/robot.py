@@ -123,6 +123,12 @@ def _prepare_self_collision(
         ignored_pairs: what the file excludes from contact.
         write: :func:`vrrt_jax.robots.mjcf_writer.collision_mjcf` but for the two results.
     """
+    if not self_collision.can_touch_itself(model):
+        warnings.warn(
+            "the contact bits of the robot let no two of its links touch: it is never checked "
+            'against itself; give its geoms contype="1" conaffinity="1" to have that checked',
+            stacklevel=3,
+        )
     # Bodies that never touch in random configurations, or nearly always, need no check.
     sample = self_collision.sample_self_collisions(model, _NUM_SAMPLES, np.random.default_rng(0))
     ignored = sorted({*ignored_pairs, *self_collision.find_ignored_pairs(model, sample)})
