@@ -27,7 +27,7 @@ from vrrt_jax.robots.geom_pieces import collision_pieces
 from vrrt_jax.robots.kinematics import BodySpheres
 
 MAX_BULGE = 0.03  # [m] how far spheres stick out of the bodies of a loaded robot at most
-_FINE_BULGE, _FEW_SPHERES = 0.02, 50  # [m] of a body that so many spheres are enough for
+_FINE_BULGE, _FEW_SPHERES = 0.02, 12  # [m] of a body that so many spheres are enough for
 _RELATIVE_BULGE = 0.1  # of the extent of the body, if that is less
 MOST_SPHERES = 2000  # of one body
 _ROUNDING = 1e-6  # a length is divided into n parts if it exceeds n parts by less
