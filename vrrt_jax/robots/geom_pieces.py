@@ -37,13 +37,30 @@ def collision_pieces(model: mujoco.MjModel) -> dict[int, list[Piece]]:
 
 def _geom_points(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
     """Points (n, 3) in the geom's frame whose hull contains it, and the hull's excess [m]."""
-    kinds = mujoco.mjtGeom
-    kind, size = model.geom_type[geom], model.geom_size[geom]
-    if kind == kinds.mjGEOM_MESH:
+    kind = mujoco.mjtGeom(model.geom_type[geom])
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]
         start = model.mesh_vertadr[mesh]
         points = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
         return solid(np.asarray(points, np.float64)), 0.0
+    found = primitive_points(kind, model.geom_size[geom])
+    if found is None:
+        name = model.body(model.geom_bodyid[geom]).name
+        raise ValueError(
+            f"a collision geom of body '{name}' is a {kind.name[7:].lower()}; expected sphere, "
+            "box, capsule, cylinder, ellipsoid or mesh: replace it"
+        )
+    return found
+
+
+def primitive_points(kind: mujoco.mjtGeom, size: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Points (n, 3) whose hull contains a primitive, and how far it sticks out at most [m].
+
+    Args:
+        kind: None is returned for those that are no primitive.
+        size: (3,) as MuJoCo's [m].
+    """
+    kinds = mujoco.mjtGeom
     if kind == kinds.mjGEOM_BOX:
         return _corners() * size, 0.0
     sides = _sides(size.max() if kind == kinds.mjGEOM_ELLIPSOID else size[0])
@@ -59,11 +76,7 @@ def _geom_points(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
     if kind == kinds.mjGEOM_CAPSULE:
         ball = _ball(sides) * size[0]
         return np.vstack([ball + [0, 0, z] for z in (-size[1], size[1])]), wider * size[0]
-    name = model.body(model.geom_bodyid[geom]).name
-    raise ValueError(
-        f"a collision geom of body '{name}' is a {kinds(kind).name[7:].lower()}; expected sphere, "
-        "box, capsule, cylinder, ellipsoid or mesh: replace it"
-    )
+    return None
 
 
 def _corners() -> np.ndarray:
