@@ -12,6 +12,7 @@ _PACKAGES = ("package://", "model://", "$(find ")  # before the name of a packag
 _FILE = "file://"
 _READ = (".stl", ".obj", ".msh")  # endings of the meshes that MuJoCo reads
 _LIMITED = ("revolute", "prismatic")
+_NAMES = {"lower", "upper"}
 _MOST_PARENTS = 6  # folders above the file that meshes are looked for in
 
 
@@ -39,6 +40,11 @@ def urdf_spec(root: ElementTree.Element, path: Path, *, visuals: bool) -> mujoco
     for tag in ("mujoco", "compiler"):
         found = compiler.find(tag)
         compiler = ElementTree.SubElement(compiler, tag) if found is None else found
+    for joint in root.findall("joint"):
+        limit = joint.find("limit")
+        if limit is not None and joint.get("type") in _LIMITED and _NAMES & set(limit.keys()):
+            for name in sorted(_NAMES):
+                limit.set(name, limit.get(name, "0"))  # MuJoCo takes one alone for none at all
     compiler.set("discardvisual", "false" if visuals else "true")
     folder = path.resolve().parent
     for link, kind, mesh in _meshes(root):

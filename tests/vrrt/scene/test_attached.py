@@ -65,7 +65,8 @@ def on_table(panda):
 @pytest.mark.parametrize("kind", SHAPES)
 @pytest.mark.parametrize("scale", [1.0, 3.0, 8.0])
 def test_the_spheres_contain_the_object(kind, scale, rng):
-    size = tuple(scale * s for s in SHAPES[kind])
+    x, y, z = SHAPES[kind]
+    size = (scale * x, scale * y, scale * z)
     found = cover(kind, size)
     assert found.bulge <= MAX_BULGE
     assert len(found.radius) <= MOST_SPHERES or scale > 1
