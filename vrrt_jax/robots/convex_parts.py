@@ -66,7 +66,8 @@ def _simpler(vertices: np.ndarray) -> ConvexHull:
     middle = vertices - vertices.mean(axis=0)
     spread, axes = np.linalg.eigh(middle.T @ middle / len(middle))
     round_shape = middle @ axes / np.sqrt(np.maximum(spread, 1e-12 * spread.max()))
-    kept = np.unique(np.argmax(round_shape @ sphere_directions(_NUM_EXTREMES).T, axis=0))
+    directions = _blocks(sphere_directions(_NUM_EXTREMES), len(vertices))
+    kept = np.unique(np.concatenate([(d @ round_shape.T).argmax(axis=1) for d in directions]))
     inner = ConvexHull(vertices[kept])
     while True:
         # Take in what sticks out most of each face.
@@ -81,9 +82,9 @@ def _simpler(vertices: np.ndarray) -> ConvexHull:
 
 def _farthest(vertices: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of each plane (p, 4) the vertex (p,) that is farthest outside, and how far (p,) [m]."""
-    beyond = vertices @ planes[:, :3].T + planes[:, 3]
-    farthest = beyond.argmax(axis=0)
-    return farthest, beyond[farthest, np.arange(len(planes))]
+    beyond = planes[:, :3] @ vertices.T
+    farthest = beyond.argmax(axis=1)
+    return farthest, beyond[np.arange(len(planes)), farthest] + planes[:, 3]
 
 
 def _blocks(rows: np.ndarray, width: int) -> list[np.ndarray]:

@@ -75,7 +75,8 @@ def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None =
     Raises:
         FileNotFoundError: the path leads to no file.
         ValueError: the name is unknown, the file is unreadable, a mesh is nowhere, a joint cannot
-            be planned or its limits are unclear, or ``freeze`` names a joint that does not exist or puts one outside of its range.
+            be planned or its limits are unclear, or ``freeze`` names a joint that does not exist
+            or puts one outside of its range.
     """
     path = robot_path(name_or_path)
     spec = mjcf.read_spec(path)
