@@ -8,6 +8,8 @@ import numpy as np
 import yaml
 from PIL import Image, UnidentifiedImageError
 
+from vrrt_jax.robots.names import free_name
+
 RESOLUTION = 0.1  # side of the cells that planners and networks expect [m]
 HEIGHT = 2.0  # of the maps [m]; homes end there
 _UNKNOWN = 0.196  # just below the occupancy of ROS's gray 205, which stands for unknown
@@ -221,14 +223,15 @@ def _read_mjcf(path: Path) -> Grid:
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         half = RESOLUTION / 2 * (1 - 1e-3)
-        spec.worldbody.add_geom(name=_PROBE, type=mujoco.mjtGeom.mjGEOM_BOX, size=[half] * 3)
+        name = free_name(_PROBE, {geom.name for geom in spec.geoms})
+        spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=[half] * 3)
         model = spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo cannot compile it: {error}") from error
     # The geoms that can be collided with, at their places.
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    probe = model.geom(_PROBE).id
+    probe = model.geom(name).id
     data.geom_xmat[probe] = np.eye(3).ravel()
     geoms = np.flatnonzero(
         (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)

@@ -16,7 +16,7 @@ from vrrt_jax.robots.kinematics import (
     link_poses,
     spheres_on_links,
 )
-from vrrt_jax.robots.mjcf import joint_ranges
+from vrrt_jax.robots.limits import joint_ranges
 from vrrt_jax.robots.self_collision import checked_pairs
 from vrrt_jax.robots.sphere_cover import cover_primitives
 

@@ -40,9 +40,9 @@ def attach(
     The object is checked against all obstacles, against all other links of the robot, and against
     what these hold. It may touch whatever the same joint carries: the hand and its fingers.
 
-    The planner sees spheres around the object, 24 at most. They stick out of it by 1 cm, of objects
-    that are larger than a hand by more; ``world.attached[-1].bulge`` says by how much. The exact
-    check sees the object itself.
+    The planner sees spheres around the object: 24 at most that stick out of it by 1 cm, of objects
+    that are larger than a hand by up to 3 cm, and around large plates more of them.
+    ``world.attached[-1].bulge`` says how far. The exact check sees the object itself.
 
     An object often stands on something where it is gripped, and is modeled to sink in a little. So
     from then on the object may be as deep in each obstacle as it was at ``q``, and 1 mm more. That

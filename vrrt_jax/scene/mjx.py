@@ -260,7 +260,8 @@ def _answers(scene: MjxScene, others: Any, q: jax.Array) -> tuple[jax.Array, ...
     size = -(-len(q) // num_blocks)
     padded = jnp.pad(q, ((0, num_blocks * size - len(q)), (0, 0)))
     parts = jax.lax.map(block, padded.reshape(num_blocks, size, -1))
-    return tuple(part.reshape(-1, *part.shape[2:])[: len(q)] for part in parts)
+    total = num_blocks * size  # robots without self-collision spheres have no place for "-1"
+    return tuple(part.reshape(total, *part.shape[2:])[: len(q)] for part in parts)
 
 
 @functools.lru_cache(maxsize=64)
