@@ -11,10 +11,16 @@ import numpy as np
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.check_protocols import check_extracted_path
 from vrrt_jax.core.command import usable_cores
-from vrrt_jax.core.goal import ConfigurationGoal
+from vrrt_jax.core.goal import ConfigurationGoal, starts_at
 from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.result import ABORTED, STATUS_OF, PlanResult, Status, with_time_of
-from vrrt_jax.core.search import SearchResult, StopReason, make_termination, search
+from vrrt_jax.core.search import (
+    SearchResult,
+    StopReason,
+    make_termination,
+    no_search,
+    search,
+)
 from vrrt_jax.core.types import ExpansionPolicy
 from vrrt_jax.outcome import JOINT_ADVICE, Chosen, Progress, finish, time_left
 from vrrt_jax.robots.robot import Robot
@@ -72,8 +78,13 @@ def _attempt(
     """One attempt, which keeps ``config.path.margin`` from everything if it can.
 
     It keeps less where start or goal are nearer than that. If no path is found soon, one is
-    searched for without.
+    searched for without. A plan that starts at its goal has nothing to search for.
     """
+    if starts_at(goal, world, q_start):
+        tree = policy.init(world, goal, q_start[None], config.tree.capacity)
+        chosen = _chosen(world, goal, q_start[None], q_start)
+        result = finish(robot, world, no_search(policy, tree), chosen, q_start, key, config)
+        return dataclasses.replace(result, advice=JOINT_ADVICE[result.status])
     wary = keeping_clearance(world, np.stack([q_start, goal.q]), config.path.margin)
     limit = config.budget.max_iterations
     # A planner that goes on to improve gets all of its iterations with the clearance.

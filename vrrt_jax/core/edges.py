@@ -177,13 +177,22 @@ def difference(world: StraightLineEdges, q_from: jax.Array, q_to: jax.Array) -> 
     return short_way(q_to - q_from, world.is_continuous)
 
 
+def steps_between(world: StraightLineEdges, q_from: np.ndarray, q_to: np.ndarray) -> np.ndarray:
+    """Steps (..., D) from configurations to others, the short way round; on the host."""
+    step = q_to - q_from
+    return step - 2 * np.pi * np.round(step / (2 * np.pi)) * np.asarray(world.is_continuous)
+
+
 def joint_error(world: StraightLineEdges, q: np.ndarray, q_goal: np.ndarray) -> np.ndarray:
     """Distance (D,) of each joint from a goal, the short way round [rad] or [m]; on the host."""
     return np.abs(np.asarray(difference(world, jnp.asarray(q), jnp.asarray(q_goal))))
 
 
 def unwrapped(world: StraightLineEdges, path: np.ndarray) -> np.ndarray:
-    """The path (P, D) with joints that wrap going on, so that a controller may interpolate."""
+    """The path (P, D) from where it starts, with joints that wrap going on from there.
+
+    A controller may interpolate it, also beyond a turn.
+    """
     path, is_continuous = np.array(path), np.asarray(world.is_continuous)
     path[:, is_continuous] = np.unwrap(path[:, is_continuous], axis=0)
     return path
@@ -198,6 +207,12 @@ def normalize(world: StraightLineEdges, q: jax.Array) -> jax.Array:
     """Bring wrapping joints of (..., D) back to [-pi, pi)."""
     turns = jnp.where(world.is_continuous, jnp.floor((q + jnp.pi) / (2 * jnp.pi)), 0.0)
     return q - 2 * jnp.pi * turns
+
+
+def nearest_turn(world: StraightLineEdges, q: np.ndarray, q_near: np.ndarray) -> np.ndarray:
+    """The same configurations (..., D), whole turns nearer to others (..., D); on the host."""
+    turns = np.round((np.asarray(q_near, float) - q) / (2 * np.pi))
+    return np.asarray(q + 2 * np.pi * turns * np.asarray(world.is_continuous), np.float32)
 
 
 def enforce_bounds(world: StraightLineEdges, q: jax.Array) -> jax.Array:

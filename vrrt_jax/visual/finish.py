@@ -75,12 +75,13 @@ def finish_visual(
     found, ends = _choose_ends(world, problem, policy, found, q_start, key, config)
 
     # Try the ends in turn: by the tree's own path, straight, or by RRT-Connect.
-    path, end = None, ends.order[0]
+    path, end, refused = None, ends.order[0], 0
     all_collide = not np.isfinite(ends.cost[end])
     for candidate in [] if all_collide else ends.order[:MAX_GOALS]:
         path = ends.paths.get(candidate)
         if path is None:
-            found, path = _straight(robot, world, found, q_start, ends.q[candidate])
+            found, path, is_refused = _straight(robot, world, found, q_start, ends.q[candidate])
+            refused += is_refused
         if path is None:
             found, path = _connect(world, found, q_start, ends.q[candidate], key, config)
         if path is not None:
@@ -90,6 +91,7 @@ def finish_visual(
     target, loss = ends.q[end], float(ends.loss[end])
     chosen = Chosen(path=path, target=target, loss=loss, threshold=ends.threshold)
     result = finish(robot, world, found, chosen, q_start, key, config)
+    result = dataclasses.replace(result, refused=result.refused + refused)
 
     # A path that the exact check refuses is sought again, farther away from obstacles.
     for again in range(1, MAX_REPLANS):
@@ -206,11 +208,11 @@ def _best_nodes(
 
 def _straight(
     robot: Robot, world: World, found: SearchResult, q_start: np.ndarray, q_goal: np.ndarray
-) -> tuple[SearchResult, np.ndarray | None]:
-    """The straight path (2, D) if it is free; the time for the check is added to the search's.
+) -> tuple[SearchResult, np.ndarray | None, bool]:
+    """The straight path (2, D) if it is free, and whether the exact check refused it.
 
-    The exact check judges, which also grants what the covering spheres refuse. A world with an
-    ``is_free`` of its own is asked as well.
+    The time for the check is added to the search's. The exact check judges, which also grants what
+    the covering spheres refuse. A world with an ``is_free`` of its own is asked as well.
     """
     exact_scene(robot, world)  # built once, and no part of any search
     started = time.perf_counter()
@@ -223,7 +225,7 @@ def _straight(
         clear = int(free_prefix(world, jnp.asarray(path[:1]), edge, steps)[0]) == steps
     spent_s = time.perf_counter() - started
     found = dataclasses.replace(found, search_s=found.search_s + spent_s)
-    return found, path if clear else None
+    return found, path if clear else None, not seen.ok
 
 
 def _connect(
