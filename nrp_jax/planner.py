@@ -22,6 +22,7 @@ from vrrt_jax.core.goal import ConfigurationGoal, starts_at
 from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.planners import RRT, RRTConnect
 from vrrt_jax.core.postprocess import CheckedPath, plan_result, postprocess, unchecked
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import STATUS_OF, PlanResult, Status
 from vrrt_jax.core.search import SearchResult, make_termination, no_search, search
 from vrrt_jax.core.settings import check_settings
@@ -44,6 +45,7 @@ ADVICE = {
 }
 
 
+@single_precision
 def plan(
     robot: MobileRobot,
     grid: Grid,

@@ -13,6 +13,7 @@ from vrrt_jax.core.check_protocols import check_extracted_path
 from vrrt_jax.core.command import usable_cores
 from vrrt_jax.core.goal import ConfigurationGoal, starts_at
 from vrrt_jax.core.interrupt import interruptible
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import ABORTED, STATUS_OF, PlanResult, Status, with_time_of
 from vrrt_jax.core.search import (
     SearchResult,
@@ -29,6 +30,7 @@ from vrrt_jax.scene.world import World, keeping_clearance
 WARY_SHARE = 0.15  # of the iterations are searched with a clearance to keep, then without
 
 
+@single_precision
 def plan_to_goal(
     robot: Robot,
     world: World,

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots import Robot, load_robot, robot_names, scenes_dir
 from vrrt_jax.scene.obstacles import load_obstacles
 from vrrt_jax.scene.world import World, build_world
@@ -42,6 +43,7 @@ def problem_names() -> list[str]:
     return sorted(p.parent.name for p in (scenes_dir() / "problems").glob("*/problem.json"))
 
 
+@single_precision
 def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
     """Load a packaged problem by name, or any by its folder.
 
@@ -87,6 +89,7 @@ def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
         raise ValueError(f"'{file}' lacks the field {error}; see the packaged problems") from None
 
 
+@single_precision
 def load_world(
     name_or_path: str | Path, robot: Robot, *, engine: str = "mjx", **settings: Any
 ) -> World:
@@ -131,6 +134,7 @@ def self_model_path(robot: Robot, given: str | Path | None = None) -> Path:
     return scenes_dir() / "robots" / robot.name / "self_model.npz"
 
 
+@single_precision
 def camera_from_dict(fields: Mapping[str, Any], size: tuple[int, ...]) -> Camera:
     """A camera from JSON, for images of a size (H, W).
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import pytree
 
 Edge = Any
@@ -172,6 +173,7 @@ def short_way(step: jax.Array, is_continuous: jax.Array) -> jax.Array:
     return step - 2 * jnp.pi * turns
 
 
+@single_precision
 def difference(world: StraightLineEdges, q_from: jax.Array, q_to: jax.Array) -> jax.Array:
     """The step (..., D) from one configuration to another, the short way round."""
     return short_way(q_to - q_from, world.is_continuous)
@@ -198,6 +200,7 @@ def unwrapped(world: StraightLineEdges, path: np.ndarray) -> np.ndarray:
     return path
 
 
+@single_precision
 def distance(world: Space, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
     """Length (...) of the edge between configurations (..., D)."""
     return world.distance(q_a, q_b)

@@ -7,9 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.splat.types import Camera
 
 
+@single_precision
 def look_at(
     eye: Sequence[float],
     target: Sequence[float],
@@ -54,6 +56,7 @@ def look_at(
     return camera_from_matrix(world_to_cam, focal=float(focal), height=height, width=width)
 
 
+@single_precision
 def camera_from_matrix(
     world_to_cam: np.ndarray,
     *,
@@ -94,6 +97,7 @@ def camera_from_matrix(
     )
 
 
+@single_precision
 def orbit(
     *,
     azimuth_deg: float,
@@ -152,6 +156,7 @@ def cut(camera: Camera, corner: np.ndarray, height: int, width: int) -> Camera:
     )
 
 
+@single_precision
 def stack_cameras(cameras: Sequence[Camera]) -> Camera:
     """Stack V cameras of one size into one whose arrays lead with V."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
