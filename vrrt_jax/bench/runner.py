@@ -202,8 +202,8 @@ def summarize(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def total_refused(rows: Sequence[Mapping[str, Any]]) -> int | None:
     """Paths that the exact check refused; None where an older file did not count them."""
-    counts = [row.get("refused_paths") for row in rows]
-    return None if None in counts else sum(counts)
+    counts = [row["refused_paths"] for row in rows if "refused_paths" in row]
+    return sum(counts) if len(counts) == len(rows) else None
 
 
 def _mean(values) -> float | None:

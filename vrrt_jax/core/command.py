@@ -39,6 +39,14 @@ class Parser(argparse.ArgumentParser):
             settings.setdefault("type", words)
         return super().add_argument(*names, **settings)
 
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """See :class:`argparse.ArgumentParser`, which takes ``--seed=--`` for no value at all."""
+        found = super().parse_args(args, namespace)
+        for name, value in vars(found).items():
+            if isinstance(value, list) and not value:
+                self.error(f"argument --{name.replace('_', '-')}: expected a value")
+        return found
+
     def error(self, message: str) -> NoReturn:
         """End with the exit code 2 and one line."""
         self.exit(EXIT_BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")

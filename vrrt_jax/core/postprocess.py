@@ -7,7 +7,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from vrrt_jax.core.edges import Space
+from vrrt_jax.core.edges import Space, StraightLineEdges
 from vrrt_jax.core.result import PlanResult, Status, Verification, rejected_lanes
 from vrrt_jax.core.search import SearchResult
 from vrrt_jax.core.shortcut import path_length, shortcut, without_repeats
@@ -47,7 +47,7 @@ def unchecked(path: np.ndarray, trajectory: np.ndarray | None = None) -> Postpro
 
 
 def postprocess(
-    world: Space,
+    world: StraightLineEdges,
     raw_path: np.ndarray,
     check: Callable[[np.ndarray], CheckedPath],
     *,

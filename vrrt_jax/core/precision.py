@@ -18,6 +18,7 @@ def single_precision(function: Callable[Inputs, Output]) -> Callable[Inputs, Out
 
     It may be called inside a user's ``jit`` too. JAX arrays of 64 bit that it is given are rounded.
     """
+    apply: Any = function
 
     @functools.wraps(function)
     def run(*args: Inputs.args, **kwargs: Inputs.kwargs) -> Output:
@@ -26,7 +27,7 @@ def single_precision(function: Callable[Inputs, Output]) -> Callable[Inputs, Out
         rounded: Any = [_rounded(value) for value in args]
         named: Any = {name: _rounded(value) for name, value in kwargs.items()}
         with jax.enable_x64(False):
-            return function(*rounded, **named)
+            return apply(*rounded, **named)
 
     return run
 
