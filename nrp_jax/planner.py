@@ -182,7 +182,8 @@ def check_configuration(
         ValueError: wrong shape, not finite, outside the limits or not free.
     """
     try:
-        q = np.asarray(q, np.float32)
+        with np.errstate(over="ignore"):  # what is too large becomes infinite
+            q = np.asarray(q, np.float32)
     except (TypeError, ValueError):
         raise ValueError(f"the {what} is {q!r}; expected numbers, one for each joint") from None
     names = ", ".join(robot.joint_names)

@@ -57,7 +57,8 @@ def _array(q: Any, what: str) -> np.ndarray:
         ValueError: they are none.
     """
     try:
-        return np.asarray(q, np.float32)
+        with np.errstate(over="ignore"):  # what is too large becomes infinite
+            return np.asarray(q, np.float32)
     except (TypeError, ValueError):
         raise ValueError(f"the {what} is {q!r}; expected numbers, one for each joint") from None
 
