@@ -20,7 +20,10 @@ assert jax.jit(world.is_free)(home) and jax.jit(vrrt_jax.is_free)(world, home)
 clearance = jax.vmap(lambda q: vrrt_jax.obstacle_clearance(world, q))(home[None])
 assert clearance.dtype == jnp.float32
 both = vrrt_jax.plan_batch(
-    robot, [world] * 2, [vrrt_jax.ConfigurationGoal(q=home.at[0].add(0.3))] * 2, jnp.stack([home] * 2),
+    robot,
+    [world] * 2,
+    [vrrt_jax.ConfigurationGoal(q=home.at[0].add(0.3))] * 2,
+    jnp.stack([home] * 2),
     key=KEY,
 )
 assert all(result.ok for result in both)
