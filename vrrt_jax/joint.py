@@ -25,7 +25,7 @@ from vrrt_jax.core.search import (
 from vrrt_jax.core.types import ExpansionPolicy
 from vrrt_jax.outcome import JOINT_ADVICE, Chosen, Progress, finish, time_left
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.world import World, keeping_clearance
+from vrrt_jax.scene.world import World, checked_more_finely, keeping_clearance
 
 WARY_SHARE = 0.15  # of the iterations are searched with a clearance to keep, then without
 
@@ -43,7 +43,8 @@ def plan_to_goal(
 ) -> PlanResult:
     """Search, extract the policy's path, shorten and verify it; again, with another key, if not.
 
-    Random trees need many times longer now and then: beginning afresh is the cure for that.
+    Random trees need many times longer now and then: beginning afresh is the cure for that. After
+    a path that the exact check refused, edges are checked more finely.
 
     Args:
         robot: whose path it is.
@@ -64,6 +65,8 @@ def plan_to_goal(
             results.append(_attempt(robot, world, goal, policy, q_start, own_key, own, on_progress))
             if results[-1].ok or results[-1].status in ABORTED:
                 break
+            if results[-1].refused:
+                world = checked_more_finely(world)
     return with_time_of(results[-1], *results)
 
 

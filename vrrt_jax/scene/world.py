@@ -34,6 +34,7 @@ _NO_ENGINE = (
 ENGINES = ("mjx", "closed_form")
 
 
+FINER = 4  # times as fine are the checks of edges once the exact check has refused a path
 _MARGIN_SHARES = (1.0, 0.5, 0.25, 0.1)  # of the margin that is wanted, the largest that fits
 
 
@@ -234,6 +235,11 @@ def keeping_clearance(world: World, q: np.ndarray, margin: float) -> World:
         if bool(jnp.all(batch_is_free(wary, jnp.asarray(q, jnp.float32)))):
             return wary
     return world
+
+
+def checked_more_finely(world: World) -> World:
+    """The same world, whose edges are checked in finer steps: the exact check refused a path."""
+    return dataclasses.replace(world, resolution=world.resolution / FINER)
 
 
 def obstacle_list(world: World) -> list[Obstacle]:

@@ -21,7 +21,7 @@ from vrrt_jax.outcome import Chosen, finish, time_left
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.verify import verify_path
-from vrrt_jax.scene.world import World, with_margin
+from vrrt_jax.scene.world import World, checked_more_finely, with_margin
 from vrrt_jax.visual.distinct import distances_to, distinct
 from vrrt_jax.visual.policy import VisualRRT
 from vrrt_jax.visual.polish import Polished, evaluate_cost, linearize, polish
@@ -74,6 +74,7 @@ def finish_visual(
     search_threshold = float(problem.goal.threshold)
     found, ends = _choose_ends(world, problem, policy, found, q_start, key, config)
 
+    connector = RRTConnect.for_world(world, lanes=config.tree.lanes)
     # Try the ends in turn: by the tree's own path, straight, or by RRT-Connect.
     path, end, refused = None, ends.order[0], 0
     all_collide = not np.isfinite(ends.cost[end])
@@ -83,7 +84,8 @@ def finish_visual(
             found, path, is_refused = _straight(robot, world, found, q_start, ends.q[candidate])
             refused += is_refused
         if path is None:
-            found, path = _connect(world, found, q_start, ends.q[candidate], key, config)
+            goal = ends.q[candidate]
+            found, path = _connect(world, connector, found, q_start, goal, key, config)
         if path is not None:
             end = candidate
         if path is not None or found.stopped in EARLY_STOPS:
@@ -93,15 +95,16 @@ def finish_visual(
     result = finish(robot, world, found, chosen, q_start, key, config)
     result = dataclasses.replace(result, refused=result.refused + refused)
 
-    # A path that the exact check refuses is sought again, farther away from obstacles.
+    # A path that the exact check refuses is sought again, farther away from obstacles, with edges
+    # that are checked more finely.
     for again in range(1, MAX_REPLANS):
         if result.status is not Status.NOT_VERIFIED:
             break
         key = jax.random.fold_in(key, again)
         idle = dataclasses.replace(found, compile_s=0.0, search_s=0.0)
         rest = time_left(config, result.timing["search_s"])
-        farther = with_margin(world, again * MARGIN_STEP)
-        other, path = _connect(farther, idle, q_start, target, key, rest)
+        farther = checked_more_finely(with_margin(world, again * MARGIN_STEP))
+        other, path = _connect(farther, connector, idle, q_start, target, key, rest)
         chosen = dataclasses.replace(chosen, path=path)
         other = finish(robot, farther, other, chosen, q_start, key, config)
         other = dataclasses.replace(other, expansions=0)  # of the same search
@@ -230,6 +233,7 @@ def _straight(
 
 def _connect(
     world: World,
+    policy: RRTConnect,
     found: SearchResult,
     q_start: np.ndarray,
     q_goal: np.ndarray,
@@ -241,7 +245,6 @@ def _connect(
     If time is up meanwhile, or the user interrupts, the search has stopped for that.
     """
     goal = ConfigurationGoal(q=jnp.asarray(q_goal))
-    policy = RRTConnect.for_world(world, lanes=config.tree.lanes)
     connection = search(
         world,
         goal,
