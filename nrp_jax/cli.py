@@ -66,16 +66,16 @@ def _plan(arguments: argparse.Namespace) -> int:
     import jax
 
     from nrp_jax.homes.grid import load_map
-    from nrp_jax.planner import KINDS, plan
+    from nrp_jax.planner import KINDS, check_shape, plan
     from nrp_jax.samplers import load_sampler
     from nrp_jax.scene.robots import load_robot
     from nrp_jax.scene.world import build_world
 
     robot = load_robot(arguments.robot)
-    for name, expected in (("start", robot.num_joints), ("goal", robot.num_joints), ("crop", 4)):
-        given = getattr(arguments, name)
-        if given is not None and len(given) != expected:
-            raise ValueError(f"--{name} has {len(given)} numbers; expected {expected}")
+    for name in ("start", "goal"):
+        check_shape(robot, getattr(arguments, name), name)
+    if arguments.crop is not None and len(arguments.crop) != 4:
+        raise ValueError(f"--crop has {len(arguments.crop)} numbers; expected x0,y0,x1,y1")
     grid = load_map(arguments.map)
     if arguments.crop is not None:
         grid = grid.crop(arguments.crop[:2], arguments.crop[2:])

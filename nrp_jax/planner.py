@@ -173,6 +173,23 @@ def _config(config: PlannerConfig | None, settings: dict[str, Any]) -> PlannerCo
     return config
 
 
+def check_shape(robot: MobileRobot, q: Any, what: str) -> np.ndarray:
+    """Numbers as float32 (D,).
+
+    Raises:
+        ValueError: they are none, or not one for each joint.
+    """
+    try:
+        with np.errstate(over="ignore"):  # what is too large becomes infinite
+            q = np.asarray(q, np.float32)
+    except (TypeError, ValueError):
+        raise ValueError(f"the {what} is {q!r}; expected numbers, one for each joint") from None
+    if q.shape != (robot.num_joints,):
+        names = ", ".join(robot.joint_names)
+        raise ValueError(f"the {what} has shape {q.shape}; expected ({robot.num_joints},): {names}")
+    return q
+
+
 def check_configuration(
     robot: MobileRobot, world: GridWorld, q: np.ndarray, what: str
 ) -> jax.Array:
@@ -181,19 +198,12 @@ def check_configuration(
     Raises:
         ValueError: wrong shape, not finite, outside the limits or not free.
     """
-    try:
-        with np.errstate(over="ignore"):  # what is too large becomes infinite
-            q = np.asarray(q, np.float32)
-    except (TypeError, ValueError):
-        raise ValueError(f"the {what} is {q!r}; expected numbers, one for each joint") from None
-    names = ", ".join(robot.joint_names)
+    q = check_shape(robot, q, what)
     if world.lower.shape != (robot.num_joints,):
         raise ValueError(
             f"the world is of a robot with {len(world.lower)} joints, and '{robot.name}' has "
             f"{robot.num_joints}: build the world for it"
         )
-    if q.shape != (robot.num_joints,):
-        raise ValueError(f"the {what} has shape {q.shape}; expected ({robot.num_joints},): {names}")
     lower, upper, is_continuous = (
         np.asarray(a) for a in (world.lower, world.upper, world.is_continuous)
     )

@@ -65,7 +65,7 @@ class Attempt:
     out_of_time: bool
     loss: float
     search_s: float  # planning, without compilation
-    refused: int  # paths that the exact check refused while planning
+    refused: int = 0  # paths that the exact check refused while planning
 
 
 def solve(

@@ -109,8 +109,11 @@ def test_bad_options_are_told_before_anything_is_loaded():
         (["vrrt", "render", "--robot=panda", "--q=1", "--camera=c", "--size=9x99999"], "8192"),
         (["vrrt", "worlds", "--out=x", "--robot=panda", "--freeze=a=nan"], "finger=0.04"),
         (["vrrt", "worlds", "--out=x", "--robot=panda", "--freeze=a=1,a=2"], "once"),
-        (["nrp", "plan", "--map=x", "--start=1,2", "--goal=1,2"], "--start has 2 numbers"),
-        (["nrp", "plan", "--map=x", "--start=" + "1," * 7 + "1", "--goal=1"], "--goal has 1"),
+        (["nrp", "plan", "--map=x", "--start=1,2", "--goal=1,2"], "the start has shape (2,)"),
+        (
+            ["nrp", "plan", "--map=x", "--start=" + "1," * 7 + "1", "--goal=1"],
+            "the goal has shape (1,)",
+        ),
     ],
 )
 def test_lengths_and_names(words, told, capsys, tmp_path, monkeypatch):
