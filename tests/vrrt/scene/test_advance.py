@@ -1,11 +1,13 @@
 """The exact check misses nothing thin, however far the arm reaches, in any thread."""
 
+import dataclasses
 import gc
 import threading
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -39,6 +41,21 @@ def test_no_sheet_is_passed_through(needle, rng):
             path = np.array([[0.0, rng.uniform(-0.2, 0.2)], [1.2, rng.uniform(-0.2, 0.2)]])
             found = vrrt_jax.verify_path(needle, [sheet(angle, half)], path)
             assert not found.ok and "needle touches sheet" in str(found.contact)
+
+
+@pytest.mark.light_compilation
+def test_a_plan_around_a_thin_sheet_counts_the_paths_that_were_refused(needle):
+    """The planner's coarse steps pass through it; finer ones find the way above or below."""
+    low = dataclasses.replace(sheet(0.5, 5e-4), size=(0.1, 5e-4, 0.06))
+    world = vrrt_jax.build_world(needle, [low], engine="closed_form")
+    refused = 0
+    for seed in range(4):
+        key = jax.random.key(seed)
+        result = vrrt_jax.plan_to_configuration(needle, world, [0, 0], [1.2, 0], key=key)
+        assert result.ok
+        assert vrrt_jax.verify_path(needle, world, result.path, step=2e-4).ok
+        refused += result.refused
+    assert refused > 0
 
 
 def test_thin_rods_and_balls_in_the_way_of_the_panda_are_met(panda, rng):
