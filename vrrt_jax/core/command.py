@@ -66,7 +66,10 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
     Returns:
         The exit code: 0 solved or done, 1 not solved, 2 bad input, 130 interrupted.
     """
-    arguments = parser.parse_args(argv)
+    try:
+        arguments = parser.parse_args(argv)
+    except SystemExit as ended:  # of --help, or of an option that makes no sense
+        return int(ended.code or 0)
     name = f"{parser.prog} {arguments.command}"
     try:
         _check_outputs(arguments)
