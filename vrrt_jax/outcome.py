@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from vrrt_jax.config import PlannerConfig
+from vrrt_jax.core.edges import nearest_turn
 from vrrt_jax.core.postprocess import plan_result, postprocess, unchecked
 from vrrt_jax.core.result import EARLY_STOPS, STATUS_OF, PlanResult, Status
 from vrrt_jax.core.search import SearchResult
@@ -106,7 +107,7 @@ def finish(
         done,
         status=status,
         advice=ADVICE[status],
-        target=chosen.target,
+        target=nearest_turn(world, chosen.target, done.checked.path[-1]),
         loss=chosen.loss,
         match_threshold=chosen.threshold,
     )

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from vrrt_jax.core.fields import check_fields
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots import Robot, load_robot, robot_names, scenes_dir
 from vrrt_jax.scene.obstacles import load_obstacles
 from vrrt_jax.scene.world import World, build_world
@@ -46,6 +47,7 @@ def problem_names() -> list[str]:
     return sorted(p.parent.name for p in (scenes_dir() / "problems").glob("*/problem.json"))
 
 
+@single_precision
 def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
     """Load a packaged problem by name, or any by its folder.
 
@@ -92,6 +94,7 @@ def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
         raise ValueError(f"'{file}' lacks the field {error}; see the packaged problems") from None
 
 
+@single_precision
 def load_world(
     name_or_path: str | Path, robot: Robot, *, engine: str = "mjx", **settings: Any
 ) -> World:

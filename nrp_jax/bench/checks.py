@@ -18,6 +18,7 @@ from nrp_jax.homes.grid import Grid, load_map
 from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.robots import MobileRobot, load_robot
 from nrp_jax.scene.world import batch_is_free, build_world
+from vrrt_jax.core import command
 from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.timing import best_ms, machine
 from vrrt_jax.robots.kinematics import batch_link_poses
@@ -194,7 +195,9 @@ def add_arguments(subparsers) -> None:
     parser = subparsers.add_parser("checks", help="configuration checks: rate and errors")
     parser.set_defaults(run=_run_command)
     parser.add_argument("--map", help="a map; a random home by default")
-    parser.add_argument("--num", type=int, default=10_000, help="configurations compared")
+    parser.add_argument(
+        "--num", type=command.whole(1, 10_000_000), default=10_000, help="configurations compared"
+    )
     parser.add_argument("--json", help="write the figures here")
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from nrp_jax.scene.field import DistanceField, clearance_bound
 from nrp_jax.scene.robots import PlanarBoxes
 from vrrt_jax.core.edges import StraightLineEdges, joint_steps
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import PytreeSubclasses, pytree, static
 from vrrt_jax.robots.kinematics import Chain, link_poses, place
 
@@ -50,6 +51,7 @@ class GridWorld(PytreeSubclasses, StraightLineEdges):
     arm_weight: jax.Array  # () meters that a radian of the arm counts for
     resolution: jax.Array  # () longest sub-step of any joint [m] or [rad]
 
+    @single_precision
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`nrp_jax.scene.world.is_free`."""
         poses = link_poses(self.chain, q)

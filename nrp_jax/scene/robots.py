@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from nrp_jax.scene.mobile_mjcf import mobile_mjcf
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import pytree, static
 from vrrt_jax.robots.kinematics import (
     Chain,
@@ -79,6 +80,7 @@ class MobileRobot:
         return self.num_joints - self.lower.shape[0]
 
 
+@single_precision
 def link_features(robot: MobileRobot, q: jax.Array) -> jax.Array:
     """Points that describe the posture: tips of the snake's links, joint frames of the Fetch.
 
@@ -94,9 +96,10 @@ def link_features(robot: MobileRobot, q: jax.Array) -> jax.Array:
     return points * jnp.array([1.0, 1.0, 0.0]) if robot.planar else points
 
 
-batch_link_features = jax.jit(jax.vmap(link_features, (None, 0)))
+batch_link_features = single_precision(jax.jit(jax.vmap(link_features, (None, 0))))
 
 
+@single_precision
 @functools.cache
 def load_robot(name: str) -> MobileRobot:
     """Load "snake" (8 joints) or "fetch" (11 joints).

@@ -15,6 +15,7 @@ from nrp_jax.scene.car_world import CarWorld
 from nrp_jax.scene.field import DistanceField, make_field
 from nrp_jax.scene.grid_world import GridWorld, RoundBase
 from nrp_jax.scene.robots import MobileRobot
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots.kinematics import Chain, Spheres, placement
 
 ARM_WEIGHT = {"snake": 0.167, "fetch": 0.125}  # of the paper's metrics [m/rad]
@@ -22,6 +23,7 @@ RESOLUTION = {"snake": 0.1, "fetch": 0.2}  # sub-steps of the paper [m] and [rad
 TURNING_RADIUS = 0.1  # of the Fetch's base [m]
 
 
+@single_precision
 def is_free(world: GridWorld, q: jax.Array) -> jax.Array:
     """Whether ``q`` (D,) touches no solid cell, not the floor, nor the robot itself, () bool.
 
@@ -31,9 +33,11 @@ def is_free(world: GridWorld, q: jax.Array) -> jax.Array:
     return world.is_free(q)
 
 
-batch_is_free = jax.jit(jax.vmap(is_free, (None, 0)))  # of q (n, D), for the host
+# Of q (n, D), for the host.
+batch_is_free = single_precision(jax.jit(jax.vmap(is_free, (None, 0))))
 
 
+@single_precision
 def build_world(
     robot: MobileRobot,
     grid: Grid,
@@ -96,6 +100,7 @@ def build_world(
     return CarWorld(**fields, radius=jnp.float32(turning_radius))
 
 
+@single_precision
 def with_grid(world: GridWorld, grid: Grid) -> GridWorld:
     """The same robot in another home; nothing re-compiles if the maps are of one size.
 

@@ -77,7 +77,7 @@ def check(result, start=START, goal=GOAL):
     assert result.ok and result.verification.ok
     np.testing.assert_allclose(result.path[0], start, atol=1e-5)
     np.testing.assert_allclose(result.path[-1], goal, atol=1e-5)
-    assert result.verification.checked == len(result.trajectory)
+    assert result.verification.checked >= len(result.trajectory)
     assert result.raw_path.shape[1] == len(start)
 
 

@@ -66,6 +66,7 @@ class Attempt:
     out_of_time: bool
     loss: float
     search_s: float  # planning, without compilation
+    refused: int = 0  # paths that the exact check refused while planning
 
 
 def solve(
@@ -141,6 +142,8 @@ def solve(
         "path_over_reference": round(length / reference, 4) if success and reference else None,
         "loss": float(f"{attempt.loss:.4g}"),
         "psnr_db": round(psnr_db, 2),
+        # A path that is judged only here counts too.
+        "refused_paths": max(attempt.refused, int(not valid)),
         "time_s": round(attempt.search_s, 3),
         "wall_s": round(wall_s, 2),
     }
@@ -174,6 +177,7 @@ def _plan(inputs, key, config: PlannerConfig, masks, guess) -> Attempt:
         out_of_time=result.status is Status.TIME_LIMIT,
         loss=result.loss,
         search_s=times["search_s"] + times["shortcut_s"] + times["verify_s"],
+        refused=result.refused,
     )
 
 
@@ -191,4 +195,5 @@ def _baseline(inputs, robot_name: str, task: Task, method: str, key, masks) -> A
         out_of_time=False,
         loss=found.loss,
         search_s=found.search_s,
+        refused=found.refused,
     )

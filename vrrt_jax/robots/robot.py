@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots import frozen as frozen_joints
 from vrrt_jax.robots import limits, mjcf, mjcf_writer, self_collision
 from vrrt_jax.robots.kinematics import (
@@ -61,6 +62,7 @@ class Robot:
         return len(self.joint_names)
 
 
+@single_precision
 def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None = None) -> Robot:
     """Load a packaged robot, or any MJCF or URDF file with a fixed base.
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots.kinematics import chain_from_model
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.held import Grip, HeldObject, HeldSpheres
@@ -28,6 +29,7 @@ TOLERANCE = 1e-3  # [m] how much deeper it may be from then on
 _ROUNDING = 1e-4  # [m] of the distances of spheres where the object is gripped
 
 
+@single_precision
 def attach(
     world: World,
     obstacle: str | Obstacle,
@@ -87,6 +89,7 @@ def attach(
     return world.holding([*world.attached, held])
 
 
+@single_precision
 def detach(world: World, name: str, *, q: Sequence[float] | np.ndarray | None = None) -> World:
     """Let go of an object that :func:`attach` gave to the robot.
 

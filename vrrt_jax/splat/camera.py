@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.splat.types import Camera
 
 # Of the vertical field of view [degree]. Less is an angle in radians, more a focal length in mm.
@@ -16,6 +17,7 @@ MAX_ASPECT = 2.0  # ratio of the two focal lengths
 MAX_DISTANCE_M = 100.0  # from the world's origin; farther ones are in mm
 
 
+@single_precision
 def look_at(
     eye: Sequence[float],
     target: Sequence[float],
@@ -68,6 +70,7 @@ def look_at(
     return camera_from_matrix(world_to_cam, focal=float(focal), height=height, width=width)
 
 
+@single_precision
 def camera_from_matrix(
     world_to_cam: np.ndarray,
     *,
@@ -186,6 +189,7 @@ def _size(value: Any, what: str) -> int:
     return int(number)
 
 
+@single_precision
 def orbit(
     *,
     azimuth_deg: float,
@@ -263,6 +267,7 @@ def cut(camera: Camera, corner: np.ndarray, height: int, width: int) -> Camera:
     )
 
 
+@single_precision
 def stack_cameras(cameras: Sequence[Camera]) -> Camera:
     """Stack V cameras of one size into one whose arrays lead with V."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)

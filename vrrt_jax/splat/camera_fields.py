@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from vrrt_jax.core.fields import check_fields
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.splat.camera import camera_from_matrix, look_at
 from vrrt_jax.splat.types import Camera
 
@@ -37,6 +38,7 @@ ADVICE = {
 }
 
 
+@single_precision
 def camera_from_dict(fields: Mapping[str, Any], size: tuple[int, ...]) -> Camera:
     """A camera from JSON, for images of a size (H, W).
 

@@ -67,9 +67,10 @@ def check_views(
     views, alphas, valids = [], [], []
     for image, camera, mask in zip(images, cameras, masks, strict=True):
         pixels = _check_size(image, camera)
-        valid = np.ones(pixels.shape[:2], np.float32)
+        height, width = pixels.shape[:2]
+        valid = np.ones((height, width), np.float32)
         if mask is not None:
-            valid = valid_mask(mask, *valid.shape)
+            valid = valid_mask(mask, height, width)
         rgb, alpha = _robot_of(pixels, valid)
         alphas.append(alpha.ravel())
         valids.append(valid.ravel())

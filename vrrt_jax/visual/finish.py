@@ -21,7 +21,7 @@ from vrrt_jax.outcome import Chosen, finish, time_left
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.verify import verify_path
-from vrrt_jax.scene.world import World, with_margin
+from vrrt_jax.scene.world import World, checked_more_finely, with_margin
 from vrrt_jax.visual.distinct import distances_to, distinct
 from vrrt_jax.visual.policy import VisualRRT
 from vrrt_jax.visual.polish import Polished, evaluate_cost, linearize, polish
@@ -75,15 +75,18 @@ def finish_visual(
     found, ends = _choose_ends(world, problem, policy, found, q_start, key, config)
     stopped = found.stopped
 
+    connector = RRTConnect.for_world(world, lanes=config.tree.lanes)
     # Try the ends in turn: by the tree's own path, straight, or by RRT-Connect.
-    path, end = None, ends.order[0]
+    path, end, refused = None, ends.order[0], 0
     all_collide = not np.isfinite(ends.cost[end])
     for candidate in [] if all_collide else ends.order[:MAX_GOALS]:
         path = ends.paths.get(candidate)
         if path is None:
-            found, path = _straight(robot, world, found, q_start, ends.q[candidate])
+            found, path, is_refused = _straight(robot, world, found, q_start, ends.q[candidate])
+            refused += is_refused
         if path is None:
-            found, path = _connect(world, found, q_start, ends.q[candidate], key, config)
+            goal = ends.q[candidate]
+            found, path = _connect(world, connector, found, q_start, goal, key, config)
         if path is not None:
             end = candidate
         if path is not None or found.stopped in EARLY_STOPS:
@@ -94,16 +97,18 @@ def finish_visual(
         found = dataclasses.replace(found, stopped=stopped)
     chosen = Chosen(path=path, target=target, loss=loss, threshold=ends.threshold)
     result = finish(robot, world, found, chosen, q_start, key, config)
+    result = dataclasses.replace(result, refused=result.refused + refused)
 
-    # A path that the exact check refuses is sought again, farther away from obstacles.
+    # A path that the exact check refuses is sought again, farther away from obstacles, with edges
+    # that are checked more finely.
     for again in range(1, MAX_REPLANS):
         if result.status is not Status.NOT_VERIFIED:
             break
         key = jax.random.fold_in(key, again)
         idle = dataclasses.replace(found, compile_s=0.0, search_s=0.0)
         rest = time_left(config, result.timing["search_s"])
-        farther = with_margin(world, again * MARGIN_STEP)
-        other, path = _connect(farther, idle, q_start, target, key, rest)
+        farther = checked_more_finely(with_margin(world, again * MARGIN_STEP))
+        other, path = _connect(farther, connector, idle, q_start, target, key, rest)
         chosen = dataclasses.replace(chosen, path=path)
         other = finish(robot, farther, other, chosen, q_start, key, config)
         other = dataclasses.replace(other, expansions=0)  # of the same search
@@ -210,11 +215,11 @@ def _best_nodes(
 
 def _straight(
     robot: Robot, world: World, found: SearchResult, q_start: np.ndarray, q_goal: np.ndarray
-) -> tuple[SearchResult, np.ndarray | None]:
-    """The straight path (2, D) if it is free; the time for the check is added to the search's.
+) -> tuple[SearchResult, np.ndarray | None, bool]:
+    """The straight path (2, D) if it is free, and whether the exact check refused it.
 
-    The exact check judges, which also grants what the covering spheres refuse. A world with an
-    ``is_free`` of its own is asked as well.
+    The time for the check is added to the search's. The exact check judges, which also grants what
+    the covering spheres refuse. A world with an ``is_free`` of its own is asked as well.
     """
     exact_scene(robot, world)  # built once, and no part of any search
     started = time.perf_counter()
@@ -227,11 +232,12 @@ def _straight(
         clear = int(free_prefix(world, jnp.asarray(path[:1]), edge, steps)[0]) == steps
     spent_s = time.perf_counter() - started
     found = dataclasses.replace(found, search_s=found.search_s + spent_s)
-    return found, path if clear else None
+    return found, path if clear else None, not seen.ok
 
 
 def _connect(
     world: World,
+    policy: RRTConnect,
     found: SearchResult,
     q_start: np.ndarray,
     q_goal: np.ndarray,
@@ -243,7 +249,6 @@ def _connect(
     If time is up meanwhile, or the user interrupts, the search has stopped for that.
     """
     goal = ConfigurationGoal(q=jnp.asarray(q_goal))
-    policy = RRTConnect.for_world(world, lanes=config.tree.lanes)
     connection = search(
         world,
         goal,
