@@ -27,7 +27,7 @@ def test_joints(robot):
     assert robot.num_joints == {"snake": 8, "fetch": 11}[robot.name]
     assert np.all(robot.lower < robot.upper)
     if robot.name == "fetch":
-        np.testing.assert_allclose([robot.lower[0], robot.upper[0]], [0.1, 0.38615])
+        np.testing.assert_allclose([robot.lower[0], robot.upper[0]], [0.0, 0.38615])
         assert robot.is_continuous.tolist() == [False, False, True, False] + [
             name in ("upperarm_roll", "forearm_roll", "wrist_roll")
             for name in robot.joint_names[4:]
