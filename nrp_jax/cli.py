@@ -64,11 +64,10 @@ def _plan(arguments: argparse.Namespace) -> int:
     from nrp_jax.scene.robots import load_robot
     from nrp_jax.scene.world import build_world
 
-    robot, grid = load_robot(arguments.robot), load_map(arguments.map)
-    if arguments.crop is not None:
-        if len(arguments.crop) != 4:
-            raise ValueError(f"--crop has {len(arguments.crop)} numbers; expected x0,y0,x1,y1")
-        grid = grid.crop(arguments.crop[:2], arguments.crop[2:])
+    robot = load_robot(arguments.robot)
+    if arguments.crop is not None and len(arguments.crop) != 4:
+        raise ValueError(f"--crop has {len(arguments.crop)} numbers; expected x0,y0,x1,y1")
+    grid = load_map(arguments.map, crop=arguments.crop)
     sampler = None
     if arguments.model is not None:
         if arguments.method not in KINDS:

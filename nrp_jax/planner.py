@@ -14,9 +14,10 @@ from nrp_jax.homes.grid import Grid
 from nrp_jax.planners.nrp import NeuralRRT
 from nrp_jax.samplers import check_fits, load_sampler
 from nrp_jax.scene.exact import STEP, ExactScene, verify
+from nrp_jax.scene.nearest import advice, refusal, shifted, working_world
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld, batch_is_free, build_world
-from vrrt_jax.core.check_protocols import check_extracted_path, check_policy, overrides_is_free
+from vrrt_jax.core.check_protocols import check_extracted_path, check_policy
 from vrrt_jax.core.edges import enforce_bounds, unwrapped
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.interrupt import interruptible
@@ -91,6 +92,7 @@ def plan(
     start = check_configuration(robot, world, q_start, "start")
     goal = q_goal if isinstance(q_goal, ConfigurationGoal) else ConfigurationGoal(q=q_goal)
     goal = dataclasses.replace(goal, q=check_configuration(robot, world, goal.q, "goal"))
+    world, corner = working_world(world)
     policy = _policy(planner, robot, world, sampler, config)
     if config.capacity < policy.lanes + 2:
         raise ValueError(
@@ -118,7 +120,7 @@ def plan(
                 max_capacity=config.max_capacity,
                 on_progress=on_progress,
             )
-            results.append(_finish(scene, world, goal, policy, found, start, key))
+            results.append(_finish(scene, world, corner, goal, policy, found, start, key))
             tried += results[-1].expansions
             spent.update(results[-1].timing)
             rejected.update(results[-1].rejected)
@@ -127,9 +129,18 @@ def plan(
             world = dataclasses.replace(world, resolution=world.resolution / 2)
     # A path that was refused tells more than a search that found none.
     result = next((r for r in reversed(results) if r.verification is not None), results[-1])
-    return dataclasses.replace(
+    result = dataclasses.replace(
         result, timing=dict(spent), expansions=tried, rejected=dict(rejected)
     )
+    return _moved(result, corner)
+
+
+def _moved(result: PlanResult, corner: np.ndarray) -> PlanResult:
+    """A result whose places were measured from a corner (2,), in the map."""
+    names = ("path", "trajectory", "raw_path", "target", "alternatives")
+    places = {name: shifted(getattr(result, name), corner) for name in names}
+    tree = dataclasses.replace(result.tree, q=shifted(result.tree.q, corner))
+    return dataclasses.replace(result, tree=tree, **places)
 
 
 def _planner(planner: str | ExpansionPolicy, method: str | None) -> str | ExpansionPolicy:
@@ -163,42 +174,38 @@ def _config(config: PlannerConfig | None, settings: dict[str, Any]) -> PlannerCo
 def check_configuration(
     robot: MobileRobot, world: GridWorld, q: np.ndarray, what: str
 ) -> jax.Array:
-    """A configuration (D,) for the device.
+    """A configuration (D,) for the device, in the planners' own world, see ``working_world``.
 
     Raises:
-        ValueError: wrong shape, not finite, outside the limits or not free.
+        ValueError: wrong shape, not finite, outside the limits or not free; the message names the
+            nearest free configuration.
     """
-    q = np.asarray(q, np.float32)
-    names = ", ".join(robot.joint_names)
+    q = np.asarray(q, np.float64)
     if world.lower.shape != (robot.num_joints,):
         raise ValueError(
             f"the world is of a robot with {len(world.lower)} joints, and '{robot.name}' has "
             f"{robot.num_joints}: build the world for it"
         )
     if q.shape != (robot.num_joints,):
+        names = ", ".join(robot.joint_names)
         raise ValueError(f"the {what} has shape {q.shape}; expected ({robot.num_joints},): {names}")
-    lower, upper, is_continuous = (
-        np.asarray(a) for a in (world.lower, world.upper, world.is_continuous)
+    inner, corner = working_world(world)
+    local = shifted(q, -corner)
+    lower, upper = shifted(inner.lower, corner), shifted(inner.upper, corner)
+    bad = ~np.isfinite(q) | (
+        ((q < lower - 1e-4) | (q > upper + 1e-4)) & ~np.asarray(inner.is_continuous)
     )
-    bad = ~np.isfinite(q) | (((q < lower - 1e-4) | (q > upper + 1e-4)) & ~is_continuous)
     if bad.any():
         joint = int(np.flatnonzero(bad)[0])
         place = "the map spans" if joint < 2 else "its limits are"
+        instead = f"; {advice(robot, world, q)}" if np.isfinite(q).all() and joint > 1 else ""
         raise ValueError(
             f"the {what}'s {robot.joint_names[joint]} is {q[joint]}; {place} "
-            f"[{lower[joint]:.3f}, {upper[joint]:.3f}]"
+            f"[{lower[joint]:.3f}, {upper[joint]:.3f}]{instead}"
         )
-    inside = enforce_bounds(world, jnp.asarray(q))
-    if not batch_is_free(world, inside[None])[0]:
-        if overrides_is_free(world):
-            raise ValueError(
-                f"the {what} is refused by {type(world).__name__}.is_free: "
-                f"{np.round(q, 3).tolist()}; choose another one"
-            )
-        raise ValueError(
-            f"the {what} touches the map, the floor or the robot itself: {np.round(q, 3).tolist()};"
-            " choose another one"
-        )
+    inside = enforce_bounds(inner, jnp.asarray(local, jnp.float32))
+    if not batch_is_free(inner, inside[None])[0]:
+        raise ValueError(refusal(robot, world, q, what))
     return inside
 
 
@@ -257,6 +264,7 @@ def _policy(
 def _finish(
     scene: ExactScene,
     world: GridWorld,
+    corner: np.ndarray,
     goal: ConfigurationGoal,
     policy: ExpansionPolicy,
     found: SearchResult,
@@ -271,8 +279,8 @@ def _finish(
 
     def check(path: np.ndarray) -> CheckedPath:
         trajectory = trajectory_of(world, path)
-        limits = {"lower": np.asarray(world.lower), "upper": np.asarray(world.upper)}
-        verification = verify(scene, trajectory, **limits)
+        lower, upper = shifted(world.lower, corner), shifted(world.upper, corner)
+        verification = verify(scene, shifted(trajectory, corner), lower=lower, upper=upper)
         return CheckedPath(path=path, trajectory=trajectory, verification=verification)
 
     if loss <= threshold:

@@ -10,6 +10,7 @@ from scipy.spatial import ConvexHull
 
 from nrp_jax.homes.grid import Grid
 from nrp_jax.planner import PlanResult
+from nrp_jax.scene.nearest import shifted, working_world
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld
 
@@ -84,14 +85,14 @@ def draw_tree(axes, world: GridWorld, result: PlanResult) -> None:
     child = child[:: max(1, -(-len(child) // _MAX_EDGES))]
     if not len(child):
         return
-    q = np.asarray(result.tree.q)
+    world, corner = working_world(world)
+    q = shifted(result.tree.q, -corner).astype(np.float32)
     fraction = jnp.linspace(0, 1, _EDGE_POINTS)[None]
     lines = jax.jit(lambda w, a, b: w.interpolate(a[:, None], b[:, None], fraction))(
         world, q[parent[child]], q[child]
     )
-    axes.add_collection(
-        LineCollection(list(np.asarray(lines)[..., :2]), colors=_COLORS["tree"], linewidths=0.5)
-    )
+    lines = list(shifted(lines, corner)[..., :2])
+    axes.add_collection(LineCollection(lines, colors=_COLORS["tree"], linewidths=0.5))
 
 
 def save_plan(

@@ -4,6 +4,8 @@ Nothing here shares code with the distances and spheres that the planners comput
 there cannot hide itself.
 """
 
+import dataclasses
+
 import mujoco
 import numpy as np
 
@@ -30,6 +32,9 @@ class ExactScene:
         if robot.planar:
             grid = grid.flatten()
         self.robot = robot
+        # All is measured from the corner of the map, wherever it lies.
+        self.corner = np.array(grid.origin[:2])
+        grid = dataclasses.replace(grid, origin=(0.0, 0.0, grid.origin[2]))
         for low, high in _solid_boxes(grid, robot.planar):
             spec.worldbody.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -50,13 +55,40 @@ class ExactScene:
 
         The home is body 0. Pairs come in the order of MuJoCo's contacts.
         """
-        self.data.qpos[:] = q
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_collision(self.model, self.data)
+        self._collide(q)
         contact = self.data.contact
         deep = contact.geom[contact.dist < -_PENETRATION_TOLERANCE]
         bodies = np.sort(self.model.geom_bodyid[deep], axis=1)
         return list(dict.fromkeys((int(first), int(second)) for first, second in bodies))
+
+    def nearest_contact(self, q: np.ndarray, margin: float) -> str:
+        """Words for the pair that is nearest at ``q`` (D,), where it lies and how far apart.
+
+        Pairs farther apart than a margin [m] are not seen; "" if there is none.
+        """
+        self.model.geom_margin[:] = margin
+        self._collide(q)
+        self.model.geom_margin[:] = 0.0
+        contact = self.data.contact
+        if not len(contact.dist):
+            return ""
+        nearest = int(np.argmin(contact.dist))
+        bodies = np.sort(self.model.geom_bodyid[contact.geom[nearest]])
+        words = self.describe((int(bodies[0]), int(bodies[1])))
+        # The home is body 0: its place tells which cell it is.
+        if not bodies[0]:
+            at = contact.pos[nearest] + np.append(self.corner, 0.0)
+            words += f" at ({', '.join(f'{v:.2f}' for v in at[: 2 if self.robot.planar else 3])})"
+        if contact.dist[nearest] < -_PENETRATION_TOLERANCE:
+            return words
+        apart = 1e3 * max(float(contact.dist[nearest]), 0.0)
+        return f"{words.replace(' touches ', ' is too near to ')}, {apart:.1f} mm apart"
+
+    def _collide(self, q: np.ndarray) -> None:
+        self.data.qpos[:] = q
+        self.data.qpos[:2] -= self.corner
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_collision(self.model, self.data)
 
     def describe(self, pair: tuple[int, int]) -> str:
         """Words for a pair of bodies: "link3 touches the map"."""

@@ -9,9 +9,11 @@ import numpy as np
 from scipy import ndimage
 
 from nrp_jax.homes.grid import Grid
+from nrp_jax.homes.memory import check_memory
 from vrrt_jax.core.types import pytree
 
 FINE = 2  # lattice steps a cell: the lattice holds the corners and the centers of all cells
+_BYTES = 100  # of memory that a lattice point takes while its distance is computed
 
 
 @pytree
@@ -35,9 +37,15 @@ def make_field(grid: Grid) -> DistanceField:
 
     The lattice holds the corners of all cells. So the point of a cell that is nearest to a lattice
     point is a lattice point too, and the distance transform of the lattice is exact.
+
+    Raises:
+        ValueError: the map is too large for the memory that is free.
     """
+    shape, dims = grid.occupied.shape, 2 if grid.planar else 3
+    what = f"a map of {' x '.join(map(str, shape[:dims]))} cells"
+    check_memory(_BYTES * FINE**dims * grid.occupied.size, what)
     solid = np.pad(grid.occupied, [(1, 1), (1, 1), (0, 0)], constant_values=True)
-    for axis in range(2 if grid.planar else 3):
+    for axis in range(dims):
         solid = _refine(solid, axis)
     step = grid.resolution / FINE
     distance = ndimage.distance_transform_edt(~solid, sampling=step)
