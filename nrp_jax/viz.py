@@ -16,6 +16,7 @@ from nrp_jax.scene.world import GridWorld
 
 _EDGE_POINTS = 9  # drawn along an edge
 _MAX_EDGES = 4000  # drawn of a tree
+_MAX_PIXELS = 4000  # along the longer side of a map
 _COLORS = {"map": "#3b4252", "above": "#c3c9d4", "tree": "#7aa6c2", "path": "#d1495b"}
 
 
@@ -48,9 +49,11 @@ def draw_map(axes, grid: Grid) -> None:
     """
     low = grid.flatten(z_high=0.4).occupied[:, :, 0]
     seen = grid.occupied.any(axis=2)
+    # A picture has few pixels: one stands for several cells of a large map.
+    low, seen = (_shrunk(cells, -(-max(seen.shape) // _MAX_PIXELS)) for cells in (low & seen, seen))
     image = np.ones((*seen.shape, 3))
     image[seen] = _rgb(_COLORS["above"])
-    image[low & seen] = _rgb(_COLORS["map"])
+    image[low] = _rgb(_COLORS["map"])
     left, bottom = grid.origin[:2]
     right, top = np.array(grid.origin[:2]) + grid.size[:2]
     axes.imshow(
@@ -121,8 +124,9 @@ def save_plan(
     matplotlib.use("Agg", force=False)
     import matplotlib.pyplot as plt
 
-    width, height = grid.size[:2]
-    figure, axes = plt.subplots(figsize=(8, 8 * height / width + 0.6), layout="constrained")
+    # The longer side is 8 inches; the shorter one leaves room for axes on the narrowest map.
+    width, height = np.maximum(8 * grid.size[:2] / grid.size[:2].max(), 1.5)
+    figure, axes = plt.subplots(figsize=(width, height + 0.6), layout="constrained")
     draw_map(axes, grid.flatten() if robot.planar else grid)
     draw_tree(axes, world, result)
     trajectory = result.trajectory
@@ -160,6 +164,13 @@ def _outer_points(kind: mujoco.mjtGeom, size: np.ndarray) -> np.ndarray:
         return np.concatenate([size[0] * ball + half, size[0] * ball - half])
     ring = size[0] * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     return np.concatenate([ring + half, ring - half])
+
+
+def _shrunk(cells: np.ndarray, block: int) -> np.ndarray:
+    """Cells (X, Y) bool in blocks, True where any of a block is."""
+    padded = np.pad(cells, [(0, -side % block) for side in cells.shape])
+    x, y = (side // block for side in padded.shape)
+    return padded.reshape(x, block, y, block).any(axis=(1, 3))
 
 
 def _rgb(color: str) -> tuple[float, ...]:

@@ -28,7 +28,7 @@ def read_mjcf_map(path: Path, crop: tuple[float, float, float, float] | None) ->
 
     Args:
         path: of the scene.
-        crop: is cut out by the caller.
+        crop: x0, y0, x1, y1 of the part to read, and a cell around it [m]; all of it if None.
 
     Raises:
         ValueError: MuJoCo cannot compile the scene, or it holds nothing solid, or something whose
@@ -53,7 +53,7 @@ def read_mjcf_map(path: Path, crop: tuple[float, float, float, float] | None) ->
     is_plane = model.geom_type == _KINDS.mjGEOM_PLANE
     planes, geoms = (np.flatnonzero(solid & kind) for kind in (is_plane, ~is_plane))
     for geom in geoms:
-        if model.geom_type[geom] not in _MEASURED:
+        if _KINDS(model.geom_type[geom]) not in _MEASURED:
             kind = _KINDS(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
             raise ValueError(f"its {_name(model, int(geom))} is of kind {kind}; make it of boxes")
     # A grid around all of them but for the floor, in cells of 0.1 m.
@@ -64,10 +64,13 @@ def read_mjcf_map(path: Path, crop: tuple[float, float, float, float] | None) ->
         raise ValueError("the scene has no geom to collide with but floors")
     low = np.append(np.min([b[0] for b in outer], axis=0)[:2], 0.0)
     high = np.append(np.max([b[1] for b in outer], axis=0)[:2], HEIGHT)
+    if crop is not None:
+        low[:2] = np.maximum(low[:2], np.array(crop[:2]) - RESOLUTION)
+        high[:2] = np.minimum(high[:2], np.array(crop[2:]) + RESOLUTION)
     first = np.floor(low / RESOLUTION + 1e-6).astype(int)
     shape = np.ceil(high / RESOLUTION - 1e-6).astype(int) - first
     if (shape < 1).any():
-        raise ValueError("its walls enclose nothing: they all lie in one plane")
+        raise ValueError(f"nothing of it lies between {low[:2].tolist()} and {high[:2].tolist()}")
     check_memory(30.0 * shape.prod(), f"a map of {shape[0]} x {shape[1]} x {shape[2]} cells")
     occupied = np.zeros(shape, bool)
     for geom in planes:
