@@ -185,12 +185,12 @@ def _ratio(small: float, large: float, cells: int) -> tuple[int, int]:
     """The simplest fraction p / q that is the ratio of two sides, or nearly.
 
     Files hold rounded numbers, as 0.0500000007 of float32. Over all cells of a map the fraction is
-    wrong by a hundredth of a small cell at most.
+    wrong by a twentieth of a small cell at most.
     """
     ratio = small / large
     for q in range(1, 1_000_000):
         p = max(round(ratio * q), 1)
-        if abs(p / q - ratio) * cells <= 0.01 * ratio:
+        if abs(p / q - ratio) * cells <= 0.05 * ratio:
             return p, q
     raise ValueError(f"the map's cells of {small} m are too small to be joined to {large} m")
 

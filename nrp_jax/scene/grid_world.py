@@ -82,7 +82,7 @@ class GridWorld(PytreeSubclasses, StraightLineEdges):
 
     def interpolate(self, q_a: jax.Array, q_b: jax.Array, fraction: jax.Array) -> jax.Array:
         """Configurations (..., D) at a fraction (...) of the edges between others (..., D)."""
-        part = self.truncate(self.edge(q_a, q_b), jnp.asarray(fraction, q_a.dtype))
+        part = self.truncate(self.edge(q_a, q_b), jnp.asarray(fraction, jnp.asarray(q_a).dtype))
         return self.normalize(self.end(q_a, part))
 
     def distances(self, nodes: jax.Array, q: jax.Array, among: jax.Array) -> jax.Array:
