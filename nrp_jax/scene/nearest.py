@@ -13,6 +13,7 @@ from vrrt_jax.core.check_protocols import overrides_is_free
 
 WITHIN_M, WITHIN_RAD = 0.05, 0.1  # how far a free configuration is looked for, joint by joint
 _BATCH, _ROUNDS = 2048, 8
+_FAR = 2000.0  # [m] where float32 tells places a tenth of a millimeter apart
 _AROUND = 2.0  # [m] of the map around the base that decides what the robot touches
 _MARGIN = 0.05  # [m] within which pairs are named that do not touch
 
@@ -22,10 +23,19 @@ def working_world(world: GridWorld) -> tuple[GridWorld, np.ndarray]:
 
     It begins at the corner of the map. A subclass with an ``is_free`` of its own knows the places
     of the map, and stays as it is.
+
+    Raises:
+        ValueError: such a subclass, on a map so far away that float32 has too few digits.
     """
-    if overrides_is_free(world):
-        return world, np.zeros(2)
-    return from_corner(world), corner_of(world)
+    corner = corner_of(world)
+    if not overrides_is_free(world):
+        return from_corner(world), corner
+    if np.abs(corner).max() > _FAR:
+        raise ValueError(
+            f"the map begins at {tuple(corner.tolist())} m, too far away for the is_free of "
+            f"{type(world).__name__}; shift the map's origin to within {_FAR:g} m of 0"
+        )
+    return world, np.zeros(2)
 
 
 def shifted(q: np.ndarray, by: np.ndarray) -> np.ndarray:

@@ -119,6 +119,27 @@ def test_plans_are_the_same_up_to_the_shift(tmp_path):
     assert (tmp_path / "plan.png").stat().st_size > 10_000
 
 
+class West(nrp_jax.GridWorld):
+    """A home whose eastern part is closed."""
+
+    def is_free(self, q):
+        return super().is_free(q) & (q[0] < 102.0)
+
+
+def test_a_constraint_of_ones_own_sees_the_places_of_the_map():
+    robot = nrp_jax.load_robot("snake")
+    q = np.array([101.0, 52.0, 0.6, 1.0, -0.8, 1.0, -0.8, 0.9])
+    grid = nrp_jax.Grid(occupied=np.zeros((40, 40), bool), origin=(100.0, 50.0))
+    world = West(**vars(nrp_jax.build_world(robot, grid)))
+    check_configuration(robot, world, q, "start")
+    q[0] = 103.0
+    with pytest.raises(ValueError, match="the start is refused by West.is_free"):
+        check_configuration(robot, world, q, "start")
+    far = nrp_jax.with_grid(world, dataclasses.replace(grid, origin=(500000.0, 4600000.0)))
+    with pytest.raises(ValueError, match="too far away for the is_free of West; shift the map"):
+        check_configuration(robot, far, q + np.append([499900.0, 4599950.0], np.zeros(6)), "start")
+
+
 def test_a_picture_of_a_long_map_is_small(tmp_path):
     from PIL import Image
 
