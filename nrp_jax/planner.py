@@ -139,7 +139,7 @@ def _moved(result: PlanResult, corner: np.ndarray) -> PlanResult:
     """A result whose places were measured from a corner (2,), in the map."""
     names = ("path", "trajectory", "raw_path", "target", "alternatives")
     places = {name: shifted(getattr(result, name), corner) for name in names}
-    tree = dataclasses.replace(result.tree, q=shifted(result.tree.q, corner))
+    tree = dataclasses.replace(result.tree, q=shifted(np.asarray(result.tree.q), corner))
     return dataclasses.replace(result, tree=tree, **places)
 
 
@@ -191,7 +191,7 @@ def check_configuration(
         raise ValueError(f"the {what} has shape {q.shape}; expected ({robot.num_joints},): {names}")
     inner, corner = working_world(world)
     local = shifted(q, -corner)
-    lower, upper = shifted(inner.lower, corner), shifted(inner.upper, corner)
+    lower, upper = (shifted(np.asarray(a), corner) for a in (inner.lower, inner.upper))
     bad = ~np.isfinite(q) | (
         ((q < lower - 1e-4) | (q > upper + 1e-4)) & ~np.asarray(inner.is_continuous)
     )
@@ -279,7 +279,7 @@ def _finish(
 
     def check(path: np.ndarray) -> CheckedPath:
         trajectory = trajectory_of(world, path)
-        lower, upper = shifted(world.lower, corner), shifted(world.upper, corner)
+        lower, upper = (shifted(np.asarray(a), corner) for a in (world.lower, world.upper))
         verification = verify(scene, shifted(trajectory, corner), lower=lower, upper=upper)
         return CheckedPath(path=path, trajectory=trajectory, verification=verification)
 

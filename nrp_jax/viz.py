@@ -50,7 +50,8 @@ def draw_map(axes, grid: Grid) -> None:
     low = grid.flatten(z_high=0.4).occupied[:, :, 0]
     seen = grid.occupied.any(axis=2)
     # A picture has few pixels: one stands for several cells of a large map.
-    low, seen = (_shrunk(cells, -(-max(seen.shape) // _MAX_PIXELS)) for cells in (low & seen, seen))
+    block = -(-max(seen.shape) // _MAX_PIXELS)
+    low, seen = (_shrunk(np.asarray(cells), block) for cells in (low & seen, seen))
     image = np.ones((*seen.shape, 3))
     image[seen] = _rgb(_COLORS["above"])
     image[low] = _rgb(_COLORS["map"])
@@ -89,12 +90,12 @@ def draw_tree(axes, world: GridWorld, result: PlanResult) -> None:
     if not len(child):
         return
     world, corner = working_world(world)
-    q = shifted(result.tree.q, -corner).astype(np.float32)
+    q = shifted(np.asarray(result.tree.q), -corner).astype(np.float32)
     fraction = jnp.linspace(0, 1, _EDGE_POINTS)[None]
     lines = jax.jit(lambda w, a, b: w.interpolate(a[:, None], b[:, None], fraction))(
         world, q[parent[child]], q[child]
     )
-    lines = list(shifted(lines, corner)[..., :2])
+    lines = list(shifted(np.asarray(lines), corner)[..., :2])
     axes.add_collection(LineCollection(lines, colors=_COLORS["tree"], linewidths=0.5))
 
 
@@ -170,7 +171,7 @@ def _shrunk(cells: np.ndarray, block: int) -> np.ndarray:
     """Cells (X, Y) bool in blocks, True where any of a block is."""
     padded = np.pad(cells, [(0, -side % block) for side in cells.shape])
     x, y = (side // block for side in padded.shape)
-    return padded.reshape(x, block, y, block).any(axis=(1, 3))
+    return np.asarray(padded.reshape(x, block, y, block).any(axis=(1, 3)))
 
 
 def _rgb(color: str) -> tuple[float, ...]:

@@ -68,7 +68,9 @@ def test_a_refusal_names_what_touches_and_the_nearest_free(fetch, room, change, 
 def test_the_nearest_free_configuration_is_near(fetch, room):
     _, world = room
     q = TUCK.copy()
-    np.testing.assert_allclose(nrp_jax.nearest_free(fetch, world, q), q, atol=1e-5)
+    found = nrp_jax.nearest_free(fetch, world, q)
+    assert found is not None
+    np.testing.assert_allclose(found, q, atol=1e-5)
     q[0] = 0.27  # the base has a radius of 0.28 m
     found = nrp_jax.nearest_free(fetch, world, q)
     assert found is not None and np.linalg.norm(found - q) < 0.03

@@ -94,6 +94,7 @@ def test_cover_contains_the_primitives_at_any_configuration(robot, rng):
 
 def test_only_links_of_one_layer_of_the_snake_are_checked():
     snake = nrp_jax.load_robot("snake")
+    assert snake.planar_boxes is not None
     assert sorted(snake.planar_boxes.pairs) == [(0, 2), (0, 4), (1, 3), (1, 5), (2, 4), (3, 5)]
 
 
