@@ -198,7 +198,7 @@ def _ratio(small: float, large: float, cells: int) -> tuple[int, int]:
 def part_of(
     shape: tuple[int, int],
     resolution: float,
-    origin: tuple[float, float],
+    origin: tuple[float, ...],
     crop: tuple[float, float, float, float] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """First and last index + 1, (2,) each, of the small cells that a part is made of.

@@ -105,9 +105,8 @@ def gaps(shapes: LinkShapes, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
     middle = jnp.einsum("nij,nj->ni", pose[:, :3, :3], shapes.box_center) + pose[:, :3, 3]
     local = jnp.einsum("pji,jp->ip", turned[box], start[:, capsule] - middle[box].T)
     local_axis = jnp.einsum("pji,jp->ip", turned[box], axis[:, capsule])
-    to_box = _segment_to_box(
-        *jax.lax.optimization_barrier((local, local_axis)), shapes.box_half[box].T
-    )
+    local, local_axis = jax.lax.optimization_barrier((local, local_axis))
+    to_box = _segment_to_box(local, local_axis, shapes.box_half[box].T)
     return between, to_box - shapes.radius[capsule]
 
 
