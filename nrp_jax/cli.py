@@ -76,9 +76,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         check_shape(robot, getattr(arguments, name), name)
     if arguments.crop is not None and len(arguments.crop) != 4:
         raise ValueError(f"--crop has {len(arguments.crop)} numbers; expected x0,y0,x1,y1")
-    grid = load_map(arguments.map)
-    if arguments.crop is not None:
-        grid = grid.crop(arguments.crop[:2], arguments.crop[2:])
+    grid = load_map(arguments.map, crop=arguments.crop)
     sampler = None
     if arguments.model is not None:
         if arguments.method not in KINDS:

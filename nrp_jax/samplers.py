@@ -255,7 +255,7 @@ def check_fits(sampler: Any, robot: MobileRobot, world: GridWorld, kind: str) ->
             f"the map has {layers} layers of cells of {cell:g} m; samplers have seen {expected} of "
             f"{RESOLUTION} m: see nrp_jax.homes.grid.coarsened and Grid.crop"
         )
-    bottom = float(world.field.origin[2])
+    bottom = float(world.near[0].bottom)
     if not robot.planar and abs(bottom) > RESOLUTION / 2:
         raise ValueError(
             f"the map's layers begin at z = {bottom:g} m; samplers have seen maps from 0 m up: cut "

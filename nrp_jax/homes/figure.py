@@ -9,6 +9,8 @@ from nrp_jax.homes.furniture import HEIGHT
 from nrp_jax.homes.houses import CELLS, House, generate_house
 from vrrt_jax.core import command
 
+_MAX_PIXELS = 20_000  # along the longer side of a figure
+
 
 def save_figure(houses: list[House], path: str | Path) -> None:
     """Draw homes side by side: walls dark, furniture browner with its height, overhangs bluish."""
@@ -19,7 +21,8 @@ def save_figure(houses: list[House], path: str | Path) -> None:
 
     columns = min(5, len(houses))
     rows = -(-len(houses) // columns)
-    figure, axes = pyplot.subplots(rows, columns, figsize=(3.2 * columns, 3.3 * rows), dpi=110)
+    dpi = min(110, _MAX_PIXELS / (3.3 * rows))
+    figure, axes = pyplot.subplots(rows, columns, figsize=(3.2 * columns, 3.3 * rows), dpi=dpi)
     axes = np.ravel(axes)
     for axis in axes:
         axis.axis("off")

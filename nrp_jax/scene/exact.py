@@ -4,6 +4,7 @@ Nothing here shares code with the distances and spheres that the planners comput
 there cannot hide itself.
 """
 
+import dataclasses
 import threading
 
 import mujoco
@@ -34,6 +35,9 @@ class ExactScene:
         if robot.planar:
             grid = grid.flatten()
         self.robot = robot
+        # All is measured from the corner of the map, wherever it lies.
+        self.corner = np.array(grid.origin[:2])
+        grid = dataclasses.replace(grid, origin=(0.0, 0.0, grid.origin[2]))
         for low, high in _solid_boxes(grid, robot.planar):
             spec.worldbody.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -54,10 +58,16 @@ class ExactScene:
 
     def near(self, q: np.ndarray) -> Near:
         """Distances (c,) [m] and pairs of bodies (c, 2) that are near at ``q`` (D,)."""
+        local = np.array(q, np.float64)
+        local[:2] -= self.corner
+        return near_pairs(self.model, self._data(), local)
+
+    def _data(self) -> mujoco.MjData:
+        """What this thread computes in."""
         own = vars(self._own)
         if "data" not in own:
             own["data"] = mujoco.MjData(self.model)
-        return near_pairs(self.model, own["data"], q)
+        return own["data"]
 
     def touching(self, q: np.ndarray) -> list[tuple[int, int]]:
         """Pairs of bodies, smaller index first, that penetrate each other at ``q`` (D,).
@@ -67,6 +77,26 @@ class ExactScene:
         distance, bodies = self.near(q)
         bodies = np.sort(bodies[distance < -_PENETRATION_TOLERANCE], axis=1)
         return list(dict.fromkeys((int(first), int(second)) for first, second in bodies))
+
+    def nearest_contact(self, q: np.ndarray) -> str:
+        """Words for the pair that is nearest at ``q`` (D,), where it lies and how far apart.
+
+        Pairs farther apart than 0.05 m are not seen; "" if there is none.
+        """
+        distance, bodies = self.near(q)
+        if not len(distance):
+            return ""
+        nearest = int(np.argmin(distance))
+        pair = np.sort(bodies[nearest])
+        words = self.describe((int(pair[0]), int(pair[1])))
+        # The home is body 0: its place tells which cell it is.
+        if not pair[0]:
+            at = self._data().contact.pos[nearest] + np.append(self.corner, 0.0)
+            words += f" at ({', '.join(f'{v:.2f}' for v in at[: 2 if self.robot.planar else 3])})"
+        if distance[nearest] < -_PENETRATION_TOLERANCE:
+            return words
+        apart = 1e3 * max(float(distance[nearest]), 0.0)
+        return f"{words.replace(' touches ', ' is too near to ')}, {apart:.1f} mm apart"
 
     def describe(self, pair: tuple[int, int]) -> str:
         """Words for a pair of bodies: "link3 touches the map"."""
