@@ -4,6 +4,7 @@ from nrp_jax.config import PlannerConfig
 from nrp_jax.homes.grid import Grid, load_map
 from nrp_jax.planner import plan
 from nrp_jax.samplers import load_sampler
+from nrp_jax.scene.nearest import nearest_free
 from nrp_jax.scene.robots import MobileRobot, link_features, load_robot
 from nrp_jax.scene.world import GridWorld, batch_is_free, build_world, is_free, with_grid
 from vrrt_jax.core.goal import ConfigurationGoal
@@ -25,6 +26,7 @@ __all__ = [
     "load_map",
     "load_robot",
     "load_sampler",
+    "nearest_free",
     "plan",
     "with_grid",
 ]

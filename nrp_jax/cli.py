@@ -8,6 +8,7 @@ from pathlib import Path
 
 from vrrt_jax.core import command
 from vrrt_jax.core.command import EXIT_SOLVED, EXIT_UNSOLVED
+from vrrt_jax.core.files import replacing
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -39,18 +40,24 @@ def _add_plan(commands) -> None:
     plan.set_defaults(run=_plan)
     plan.add_argument("--map", required=True, help=".npz, ROS .yaml or MJCF .xml")
     plan.add_argument("--robot", default="snake", help="snake or fetch")
-    plan.add_argument("--start", type=_numbers, required=True, help="as --start=1,2.5,0,...")
-    plan.add_argument("--goal", type=_numbers, required=True, help="as --goal=...")
+    plan.add_argument("--start", type=command.numbers, required=True, help="as --start=1,2.5,0,...")
+    plan.add_argument("--goal", type=command.numbers, required=True, help="as --goal=...")
     plan.add_argument(
         "--method", default="rrt-connect", help="rrt, rrt-is, rrt-connect, nrp-d or nrp-g"
     )
     plan.add_argument("--model", help="what nrp train wrote; packaged weights by default")
-    plan.add_argument("--crop", type=_numbers, help="plan in x0,y0,x1,y1 of the map [m]")
-    plan.add_argument("--resolution", type=float, help="of collision checks [m] and [rad]")
-    plan.add_argument("--max-expansions", type=int, default=32_000, help="lanes tried")
-    plan.add_argument("--capacity", type=int, default=8192, help="nodes of the tree")
-    plan.add_argument("--time-limit", type=float, default=60.0, help="of the search [s]")
-    plan.add_argument("--seed", type=int, default=0, help="of all that is random")
+    plan.add_argument("--crop", type=command.numbers, help="plan in x0,y0,x1,y1 of the map [m]")
+    plan.add_argument(
+        "--resolution", type=command.real(1e-4, 10.0), help="of collision checks [m] and [rad]"
+    )
+    plan.add_argument(
+        "--max-expansions", type=command.whole(1, 2**31 - 1), default=32_000, help="lanes tried"
+    )
+    plan.add_argument(
+        "--capacity", type=command.whole(3, 1 << 20), default=8192, help="nodes of the tree"
+    )
+    plan.add_argument("--time-limit", type=command.seconds, default=60.0, help="of the search [s]")
+    plan.add_argument("--seed", type=command.seed, default=0, help="of all that is random")
     plan.add_argument("--out", default="out", help="folder for path.json and plan.png")
     plan.add_argument("--no-pictures", action="store_true", help="no plan.png")
 
@@ -59,16 +66,17 @@ def _plan(arguments: argparse.Namespace) -> int:
     import jax
 
     from nrp_jax.homes.grid import load_map
-    from nrp_jax.planner import KINDS, plan
+    from nrp_jax.planner import KINDS, check_shape, plan
     from nrp_jax.samplers import load_sampler
     from nrp_jax.scene.robots import load_robot
     from nrp_jax.scene.world import build_world
 
-    robot, grid = load_robot(arguments.robot), load_map(arguments.map)
-    if arguments.crop is not None:
-        if len(arguments.crop) != 4:
-            raise ValueError(f"--crop has {len(arguments.crop)} numbers; expected x0,y0,x1,y1")
-        grid = grid.crop(arguments.crop[:2], arguments.crop[2:])
+    robot = load_robot(arguments.robot)
+    for name in ("start", "goal"):
+        check_shape(robot, getattr(arguments, name), name)
+    if arguments.crop is not None and len(arguments.crop) != 4:
+        raise ValueError(f"--crop has {len(arguments.crop)} numbers; expected x0,y0,x1,y1")
+    grid = load_map(arguments.map, crop=arguments.crop)
     sampler = None
     if arguments.model is not None:
         if arguments.method not in KINDS:
@@ -91,10 +99,10 @@ def _plan(arguments: argparse.Namespace) -> int:
         capacity=arguments.capacity,
         time_limit_s=arguments.time_limit,
     )
-    out = Path(arguments.out)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "path.json").write_text(json.dumps(_record(robot.name, arguments, result), indent=1))
     print(result)
+    out, record = Path(arguments.out), _record(robot.name, arguments, result)
+    with command.or_printed(lambda: json.dumps(record)), replacing(out / "path.json", "w") as file:
+        file.write(json.dumps(record, indent=1))
     if not arguments.no_pictures:
         from nrp_jax.viz import save_plan
 
@@ -119,6 +127,7 @@ def _record(robot: str, arguments: argparse.Namespace, result) -> dict:
         "method": arguments.method,
         "seed": arguments.seed,
         "status": result.status.name,
+        "refused": result.refused,
         "verified": bool(result.verification and result.verification.ok),
         "cost": round(result.cost, 4),
         "expansions": result.expansions,
@@ -127,12 +136,3 @@ def _record(robot: str, arguments: argparse.Namespace, result) -> dict:
         "path": [[round(float(v), 5) for v in q] for q in result.path],
         "trajectory": [[round(float(v), 5) for v in q] for q in result.trajectory],
     }
-
-
-def _numbers(text: str) -> tuple[float, ...]:
-    try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"'{text}' is not a list of numbers such as 1,2.5,0"
-        ) from None

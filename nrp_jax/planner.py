@@ -14,16 +14,18 @@ from nrp_jax.homes.grid import Grid
 from nrp_jax.planners.nrp import NeuralRRT
 from nrp_jax.samplers import check_fits, load_sampler
 from nrp_jax.scene.exact import STEP, ExactScene, verify
+from nrp_jax.scene.nearest import advice, refusal, shifted, working_world
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld, batch_is_free, build_world
-from vrrt_jax.core.check_protocols import check_extracted_path, check_policy, overrides_is_free
-from vrrt_jax.core.edges import enforce_bounds, unwrapped
-from vrrt_jax.core.goal import ConfigurationGoal
+from vrrt_jax.core.check_protocols import check_extracted_path, check_policy
+from vrrt_jax.core.edges import nearest_turn, unwrapped
+from vrrt_jax.core.goal import ConfigurationGoal, starts_at
 from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.planners import RRT, RRTConnect
 from vrrt_jax.core.postprocess import CheckedPath, plan_result, postprocess, unchecked
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import STATUS_OF, PlanResult, Status
-from vrrt_jax.core.search import SearchResult, make_termination, search
+from vrrt_jax.core.search import SearchResult, make_termination, no_search, search
 from vrrt_jax.core.settings import check_settings
 from vrrt_jax.core.shortcut import padded
 from vrrt_jax.core.types import ExpansionPolicy
@@ -31,6 +33,7 @@ from vrrt_jax.core.types import ExpansionPolicy
 PLANNERS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g")
 KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae"}  # of the samplers that planners need
 ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
+MOST_TURNS = 100  # beyond so many turns float32 is too coarse for angles
 ADVICE = {
     Status.SOLVED: "",
     Status.NO_MATCH: "raise max_expansions",
@@ -43,6 +46,7 @@ ADVICE = {
 }
 
 
+@single_precision
 def plan(
     robot: MobileRobot,
     grid: Grid,
@@ -91,6 +95,7 @@ def plan(
     start = check_configuration(robot, world, q_start, "start")
     goal = q_goal if isinstance(q_goal, ConfigurationGoal) else ConfigurationGoal(q=q_goal)
     goal = dataclasses.replace(goal, q=check_configuration(robot, world, goal.q, "goal"))
+    world, corner = working_world(world)
     policy = _policy(planner, robot, world, sampler, config)
     if config.capacity < policy.lanes + 2:
         raise ValueError(
@@ -99,6 +104,10 @@ def plan(
         )
     tree = policy.init(world, goal, np.asarray(start)[None], config.capacity)
     scene = scene or ExactScene(robot, grid)
+    if starts_at(goal, world, start):
+        found = no_search(policy, tree)
+        at_goal = np.asarray(start)[None]
+        return _moved(_finish(scene, world, corner, goal, at_goal, found, key), corner)
     tried, spent, rejected = 0, Counter(), Counter()
     results: list[PlanResult] = []
     with interruptible() as interrupted:
@@ -118,7 +127,10 @@ def plan(
                 max_capacity=config.max_capacity,
                 on_progress=on_progress,
             )
-            results.append(_finish(scene, world, goal, policy, found, start, key))
+            path = policy.extract_path(found.tree)
+            check_extracted_path(policy, path, np.asarray(start))
+            raw = np.asarray(start)[None] if path is None else path
+            results.append(_finish(scene, world, corner, goal, raw, found, key))
             tried += results[-1].expansions
             spent.update(results[-1].timing)
             rejected.update(results[-1].rejected)
@@ -127,9 +139,22 @@ def plan(
             world = dataclasses.replace(world, resolution=world.resolution / 2)
     # A path that was refused tells more than a search that found none.
     result = next((r for r in reversed(results) if r.verification is not None), results[-1])
-    return dataclasses.replace(
-        result, timing=dict(spent), expansions=tried, rejected=dict(rejected)
+    result = dataclasses.replace(
+        result,
+        timing=dict(spent),
+        expansions=tried,
+        refused=sum(r.refused for r in results),
+        rejected=dict(rejected),
     )
+    return _moved(result, corner)
+
+
+def _moved(result: PlanResult, corner: np.ndarray) -> PlanResult:
+    """A result whose places were measured from a corner (2,), in the map."""
+    names = ("path", "trajectory", "raw_path", "target", "alternatives")
+    places = {name: shifted(getattr(result, name), corner) for name in names}
+    tree = dataclasses.replace(result.tree, q=shifted(np.asarray(result.tree.q), corner))
+    return dataclasses.replace(result, tree=tree, **places)
 
 
 def _planner(planner: str | ExpansionPolicy, method: str | None) -> str | ExpansionPolicy:
@@ -160,52 +185,72 @@ def _config(config: PlannerConfig | None, settings: dict[str, Any]) -> PlannerCo
     return config
 
 
+def check_shape(robot: MobileRobot, q: Any, what: str) -> np.ndarray:
+    """Numbers as float64 (D,), which places far from a map's origin need.
+
+    Raises:
+        ValueError: they are none, or not one for each joint.
+    """
+    try:
+        q = np.asarray(q, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"the {what} is {q!r}; expected numbers, one for each joint") from None
+    if q.shape != (robot.num_joints,):
+        names = ", ".join(robot.joint_names)
+        raise ValueError(f"the {what} has shape {q.shape}; expected ({robot.num_joints},): {names}")
+    return q
+
+
 def check_configuration(
     robot: MobileRobot, world: GridWorld, q: np.ndarray, what: str
 ) -> jax.Array:
-    """A configuration (D,) for the device.
+    """A configuration (D,) for the device, in the planners' own world, see ``working_world``.
 
     Raises:
-        ValueError: wrong shape, not finite, outside the limits or not free.
+        ValueError: wrong shape, not finite, outside the limits or not free; the message names the
+            nearest free configuration.
     """
-    q = np.asarray(q, np.float32)
-    names = ", ".join(robot.joint_names)
+    q = check_shape(robot, q, what)
     if world.lower.shape != (robot.num_joints,):
         raise ValueError(
             f"the world is of a robot with {len(world.lower)} joints, and '{robot.name}' has "
             f"{robot.num_joints}: build the world for it"
         )
-    if q.shape != (robot.num_joints,):
-        raise ValueError(f"the {what} has shape {q.shape}; expected ({robot.num_joints},): {names}")
-    lower, upper, is_continuous = (
-        np.asarray(a) for a in (world.lower, world.upper, world.is_continuous)
-    )
-    bad = ~np.isfinite(q) | (((q < lower - 1e-4) | (q > upper + 1e-4)) & ~is_continuous)
+    inner, corner = working_world(world)
+    local = shifted(q, -corner)
+    lower, upper = (np.asarray(a, np.float64) for a in (inner.lower, inner.upper))
+    is_continuous = np.asarray(inner.is_continuous)
+    outside = (local < lower - 1e-4) | (local > upper + 1e-4)
+    bad = ~np.isfinite(q) | (outside & ~is_continuous)
     if bad.any():
         joint = int(np.flatnonzero(bad)[0])
         place = "the map spans" if joint < 2 else "its limits are"
+        instead = f"; {advice(robot, world, q)}" if np.isfinite(q).all() and joint > 1 else ""
         raise ValueError(
             f"the {what}'s {robot.joint_names[joint]} is {q[joint]}; {place} "
-            f"[{lower[joint]:.3f}, {upper[joint]:.3f}]"
+            f"[{shifted(lower, corner)[joint]:.3f}, {shifted(upper, corner)[joint]:.3f}]{instead}"
         )
-    inside = enforce_bounds(world, jnp.asarray(q))
-    if not batch_is_free(world, inside[None])[0]:
-        if overrides_is_free(world):
-            raise ValueError(
-                f"the {what} is refused by {type(world).__name__}.is_free: "
-                f"{np.round(q, 3).tolist()}; choose another one"
-            )
+    if turned := [*np.flatnonzero(is_continuous & (np.abs(q) > 2 * np.pi * MOST_TURNS))]:
         raise ValueError(
-            f"the {what} touches the map, the floor or the robot itself: {np.round(q, 3).tolist()};"
-            " choose another one"
+            f"the {what}'s {robot.joint_names[turned[0]]} is {q[turned[0]]:.4g} rad, more than "
+            f"{MOST_TURNS} turns from zero; expected less: take whole turns of 2 pi off"
         )
-    return inside
+    # Only what rounding has put beyond a limit is put onto it: joints stay in their turn.
+    inside = np.where(is_continuous, local, np.clip(local, lower, upper)).astype(np.float32)
+    if not batch_is_free(inner, inside[None])[0]:
+        raise ValueError(refusal(robot, world, q, what))
+    return jnp.asarray(inside)
 
 
 def trajectory_of(world: GridWorld, path: np.ndarray) -> np.ndarray:
     """A path (P, D) in steps (T, D) of 0.02 m or rad at most; angles go on where they wrap."""
+    return _trajectory(world, path)[0]
+
+
+def _trajectory(world: GridWorld, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """See :func:`trajectory_of`; and where on it (P,) the waypoints are."""
     if len(path) < 2:
-        return np.asarray(path)
+        return np.asarray(path), np.arange(len(path))
     spans = np.asarray(_spans(world, padded(path)))[: len(path) - 1]
     counts = np.maximum(np.ceil(spans / STEP), 1).astype(int)
     index = np.repeat(np.arange(len(counts)), counts)
@@ -215,7 +260,8 @@ def trajectory_of(world: GridWorld, path: np.ndarray) -> np.ndarray:
     padding = (0, room - len(index))
     q_a, q_b = (np.pad(path[index + k], [padding, (0, 0)], mode="edge") for k in (0, 1))
     points = _interpolate(world, q_a, q_b, np.pad(fraction, padding))
-    return unwrapped(world, np.concatenate([path[:1], np.asarray(points)[: len(index)]]))
+    steps = unwrapped(world, np.concatenate([path[:1], np.asarray(points)[: len(index)]]))
+    return steps, np.concatenate([[0], np.cumsum(counts)])
 
 
 @jax.jit
@@ -257,22 +303,21 @@ def _policy(
 def _finish(
     scene: ExactScene,
     world: GridWorld,
+    corner: np.ndarray,
     goal: ConfigurationGoal,
-    policy: ExpansionPolicy,
+    raw: np.ndarray,
     found: SearchResult,
-    start: jax.Array,
     key: jax.Array,
 ) -> PlanResult:
-    """Shorten and verify what a search found."""
-    path = policy.extract_path(found.tree)
-    check_extracted_path(policy, path, np.asarray(start))
-    raw = np.asarray(start)[None] if path is None else path
+    """Shorten and verify what a search found, ``raw`` (P, D)."""
     loss, threshold = float(goal.loss(world, jnp.asarray(raw[-1]))), float(goal.threshold)
 
     def check(path: np.ndarray) -> CheckedPath:
-        trajectory = trajectory_of(world, path)
-        limits = {"lower": np.asarray(world.lower), "upper": np.asarray(world.upper)}
-        verification = verify(scene, trajectory, **limits)
+        trajectory, waypoints = _trajectory(world, path)
+        # Waypoints in the turns that the robot is in by then, so that they can be interpolated.
+        path = nearest_turn(world, path, trajectory[waypoints])
+        lower, upper = (shifted(np.asarray(a), corner) for a in (world.lower, world.upper))
+        verification = verify(scene, shifted(trajectory, corner), lower=lower, upper=upper)
         return CheckedPath(path=path, trajectory=trajectory, verification=verification)
 
     if loss <= threshold:
@@ -288,7 +333,7 @@ def _finish(
         done,
         status=status,
         advice=ADVICE[status],
-        target=np.asarray(goal.q),
+        target=nearest_turn(world, np.asarray(goal.q), done.checked.path[-1]),
         loss=loss,
         match_threshold=threshold,
     )

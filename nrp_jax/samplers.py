@@ -23,6 +23,7 @@ from nrp_jax.learning.network_inputs import NetworkInputs, network_inputs
 from nrp_jax.scene.robots import MobileRobot, batch_link_features, load_robot
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.edges import difference, enforce_bounds
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import pytree, static
 
 HALF_WINDOW = SIDE / 2 * RESOLUTION  # from the center of a local window to its sides [m]
@@ -186,6 +187,7 @@ def _postures(
     return enforce_bounds(world, q.at[..., :2].set(0.0)).at[..., :2].set(0.0)
 
 
+@single_precision
 def make_sampler(model: Model, **settings: Any) -> DiscriminatorSampler | CVAESampler:
     """Make a sampler of a trained model.
 
@@ -200,6 +202,7 @@ def make_sampler(model: Model, **settings: Any) -> DiscriminatorSampler | CVAESa
     return CVAESampler(num_outputs=model.info["num_outputs"], **shared)
 
 
+@single_precision
 def load_sampler(
     task: str, kind: str, path: str | Path | None = None, **settings: Any
 ) -> DiscriminatorSampler | CVAESampler:
@@ -222,6 +225,7 @@ def load_sampler(
     return make_sampler(model, **settings)
 
 
+@single_precision
 def check_fits(sampler: Any, robot: MobileRobot, world: GridWorld, kind: str) -> None:
     """Check that a sampler of this module suits a robot and a map.
 
@@ -251,7 +255,7 @@ def check_fits(sampler: Any, robot: MobileRobot, world: GridWorld, kind: str) ->
             f"the map has {layers} layers of cells of {cell:g} m; samplers have seen {expected} of "
             f"{RESOLUTION} m: see nrp_jax.homes.grid.coarsened and Grid.crop"
         )
-    bottom = float(world.field.origin[2])
+    bottom = float(world.near[0].bottom)
     if not robot.planar and abs(bottom) > RESOLUTION / 2:
         raise ValueError(
             f"the map's layers begin at z = {bottom:g} m; samplers have seen maps from 0 m up: cut "
@@ -259,6 +263,7 @@ def check_fits(sampler: Any, robot: MobileRobot, world: GridWorld, kind: str) ->
         )
 
 
+@single_precision
 @jax.jit
 def propose(
     sampler: Sampler,

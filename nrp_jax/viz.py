@@ -10,11 +10,13 @@ from scipy.spatial import ConvexHull
 
 from nrp_jax.homes.grid import Grid
 from nrp_jax.planner import PlanResult
+from nrp_jax.scene.nearest import shifted, working_world
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld
 
 _EDGE_POINTS = 9  # drawn along an edge
 _MAX_EDGES = 4000  # drawn of a tree
+_MAX_PIXELS = 4000  # along the longer side of a map
 _COLORS = {"map": "#3b4252", "above": "#c3c9d4", "tree": "#7aa6c2", "path": "#d1495b"}
 
 
@@ -47,9 +49,12 @@ def draw_map(axes, grid: Grid) -> None:
     """
     low = grid.flatten(z_high=0.4).occupied[:, :, 0]
     seen = grid.occupied.any(axis=2)
+    # A picture has few pixels: one stands for several cells of a large map.
+    block = -(-max(seen.shape) // _MAX_PIXELS)
+    low, seen = (_shrunk(np.asarray(cells), block) for cells in (low & seen, seen))
     image = np.ones((*seen.shape, 3))
     image[seen] = _rgb(_COLORS["above"])
-    image[low & seen] = _rgb(_COLORS["map"])
+    image[low] = _rgb(_COLORS["map"])
     left, bottom = grid.origin[:2]
     right, top = np.array(grid.origin[:2]) + grid.size[:2]
     axes.imshow(
@@ -84,14 +89,14 @@ def draw_tree(axes, world: GridWorld, result: PlanResult) -> None:
     child = child[:: max(1, -(-len(child) // _MAX_EDGES))]
     if not len(child):
         return
-    q = np.asarray(result.tree.q)
+    world, corner = working_world(world)
+    q = shifted(np.asarray(result.tree.q), -corner).astype(np.float32)
     fraction = jnp.linspace(0, 1, _EDGE_POINTS)[None]
     lines = jax.jit(lambda w, a, b: w.interpolate(a[:, None], b[:, None], fraction))(
         world, q[parent[child]], q[child]
     )
-    axes.add_collection(
-        LineCollection(list(np.asarray(lines)[..., :2]), colors=_COLORS["tree"], linewidths=0.5)
-    )
+    lines = list(shifted(np.asarray(lines), corner)[..., :2])
+    axes.add_collection(LineCollection(lines, colors=_COLORS["tree"], linewidths=0.5))
 
 
 def save_plan(
@@ -120,8 +125,9 @@ def save_plan(
     matplotlib.use("Agg", force=False)
     import matplotlib.pyplot as plt
 
-    width, height = grid.size[:2]
-    figure, axes = plt.subplots(figsize=(8, 8 * height / width + 0.6), layout="constrained")
+    # The longer side is 8 inches; the shorter one leaves room for axes on the narrowest map.
+    width, height = np.maximum(8 * grid.size[:2] / grid.size[:2].max(), 1.5)
+    figure, axes = plt.subplots(figsize=(width, height + 0.6), layout="constrained")
     draw_map(axes, grid.flatten() if robot.planar else grid)
     draw_tree(axes, world, result)
     trajectory = result.trajectory
@@ -159,6 +165,13 @@ def _outer_points(kind: mujoco.mjtGeom, size: np.ndarray) -> np.ndarray:
         return np.concatenate([size[0] * ball + half, size[0] * ball - half])
     ring = size[0] * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     return np.concatenate([ring + half, ring - half])
+
+
+def _shrunk(cells: np.ndarray, block: int) -> np.ndarray:
+    """Cells (X, Y) bool in blocks, True where any of a block is."""
+    padded = np.pad(cells, [(0, -side % block) for side in cells.shape])
+    x, y = (side // block for side in padded.shape)
+    return np.asarray(padded.reshape(x, block, y, block).any(axis=(1, 3)))
 
 
 def _rgb(color: str) -> tuple[float, ...]:

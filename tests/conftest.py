@@ -23,7 +23,7 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 def forget_what_was_compiled():
     """Drop compiled programs and scenes, and give what is freed back to the system."""
     jax.clear_caches()
-    exact._build.cache_clear()
+    exact.forget()
     gc.collect()
     if sys.platform == "linux":
         ctypes.CDLL("libc.so.6").malloc_trim(0)

@@ -48,8 +48,8 @@ from vrrt_jax.scene.world import (  # noqa: E402
     with_obstacles,
 )
 from vrrt_jax.splat.camera import camera_from_matrix, look_at, orbit  # noqa: E402
-from vrrt_jax.splat.images import read_image, write_image  # noqa: E402
 from vrrt_jax.splat.model import SelfModel, load_self_model, save_self_model  # noqa: E402
+from vrrt_jax.splat.picture_file import read_image, write_image  # noqa: E402
 from vrrt_jax.splat.raster import render  # noqa: E402
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel  # noqa: E402
 from vrrt_jax.visual.goal import ImageGoal, ImageObjective  # noqa: E402

@@ -16,15 +16,19 @@ from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera, SplatModel
 
+MOST_TURNS = 100  # beyond so many turns float32 is too coarse for angles
+
 
 def check_limits(robot: Robot, q: Any, what: str) -> np.ndarray:
-    """Check a configuration's shape and limits; returns it as float32 (D,).
+    """Check a configuration's shape and limits; returns it as float32 (D,), as it is.
+
+    Only what rounding has put beyond a limit is put onto it. Joints without limits stay in their
+    turn.
 
     Raises:
         ValueError: names the joint, its value and its bounds.
     """
-    q = np.asarray(q, np.float32)
-    names = robot.joint_names
+    q, names = _array(q, what), robot.joint_names
     if q.shape != (len(names),):
         raise ValueError(
             f"the {what} has shape {q.shape}; expected ({len(names)},) for the joints "
@@ -38,13 +42,25 @@ def check_limits(robot: Robot, q: Any, what: str) -> np.ndarray:
                 f"the {what} is outside the limits: joint '{name}' is at {value:.4f}, its bounds "
                 f"are [{low:.4f}, {high:.4f}]"
             )
-    turns = np.where(
-        robot.is_continuous & (np.abs(q) > np.pi), np.floor((q + np.pi) / (2 * np.pi)), 0.0
-    )
-    inside = np.where(
-        robot.is_continuous, q - 2 * np.pi * turns, np.clip(q, robot.lower, robot.upper)
-    )
-    return inside.astype(np.float32)
+        if is_continuous and abs(value) > 2 * np.pi * MOST_TURNS:
+            raise ValueError(
+                f"the {what} has joint '{name}' at {value:.4g} rad, more than {MOST_TURNS} turns "
+                "from zero; expected less: take whole turns of 2 pi off"
+            )
+    return np.where(robot.is_continuous, q, np.clip(q, robot.lower, robot.upper))
+
+
+def _array(q: Any, what: str) -> np.ndarray:
+    """Numbers as float32.
+
+    Raises:
+        ValueError: they are none.
+    """
+    try:
+        with np.errstate(over="ignore"):  # what is too large becomes infinite
+            return np.asarray(q, np.float32)
+    except (TypeError, ValueError):
+        raise ValueError(f"the {what} is {q!r}; expected numbers, one for each joint") from None
 
 
 def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.ndarray:

@@ -1,8 +1,8 @@
 """The ``vrrt`` command: plan, render, fit, spheres, bench, report, worlds."""
 
 import argparse
+import json
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,8 @@ from typing import Any
 from vrrt_jax.bench.commands import add_bench, add_robot
 from vrrt_jax.core import command
 from vrrt_jax.core.command import EXIT_SOLVED, EXIT_UNSOLVED
+
+LARGEST_SIDE = 8192  # of an image that is drawn [px]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,15 +37,15 @@ def _parser() -> argparse.ArgumentParser:
         "--start", type=command.numbers, help="start configuration, as --start=0,0.3,..."
     )
     plan.add_argument("--self-model", help="trained .npz; the robot's own by default")
-    plan.add_argument("--seed", type=int, default=0, help="of all that is random")
-    plan.add_argument("--time-limit", type=float, default=60.0, help="of the search [s]")
+    plan.add_argument("--seed", type=command.seed, default=0, help="of all that is random")
+    plan.add_argument("--time-limit", type=command.seconds, default=60.0, help="of the search [s]")
     plan.add_argument("--paper", action="store_true", help="the published settings")
-    plan.add_argument("--capacity", type=int, help="nodes of the tree")
+    plan.add_argument("--capacity", type=command.whole(8, 1 << 20), help="nodes of the tree")
     plan.add_argument("--out", default="out", help="folder for the results")
     plan.add_argument("--no-pictures", action="store_true", help="no figure and no animation")
 
     render = commands.add_parser("render", help="make a goal image with MuJoCo's renderer")
-    render.set_defaults(run=_render)
+    render.set_defaults(run=_render, out_is_file=True)
     add_robot(render)
     render.add_argument(
         "--q", type=command.numbers, required=True, help="configuration, as --q=0,0.3,..."
@@ -53,19 +55,29 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--out", required=True, help="a .png file")
 
     fit = commands.add_parser("fit", help="train a robot's self-model")
-    fit.set_defaults(run=_fit)
+    fit.set_defaults(run=_fit, out_is_file=True)
     add_robot(fit)
     fit.add_argument("--out", required=True, help="a .npz file")
-    fit.add_argument("--seed", type=int, default=0, help="of poses, cameras and splats")
-    fit.add_argument("--images", type=int, help="number of training images")
-    fit.add_argument("--detail", type=float, default=1.0, help="times the usual number of splats")
+    fit.add_argument("--seed", type=command.seed, default=0, help="of poses, cameras and splats")
+    fit.add_argument("--images", type=command.whole(1, 100_000), help="number of training images")
+    fit.add_argument(
+        "--detail",
+        type=command.real(0.01, 100.0),
+        default=1.0,
+        help="times the usual number of splats",
+    )
 
     spheres = commands.add_parser("spheres", help="fit collision spheres to a robot's meshes")
-    spheres.set_defaults(run=_spheres)
+    spheres.set_defaults(run=_spheres, out_is_file=True)
     add_robot(spheres)
     spheres.add_argument("--out", help="the MJCF file to write; only measured without it")
-    spheres.add_argument("--seed", type=int, default=0, help="of fit and measurement")
-    spheres.add_argument("--num", type=int, default=10_000, help="configurations to measure on")
+    spheres.add_argument("--seed", type=command.seed, default=0, help="of fit and measurement")
+    spheres.add_argument(
+        "--num",
+        type=command.whole(1, 10_000_000),
+        default=10_000,
+        help="configurations to measure on",
+    )
 
     bench = commands.add_parser("bench", help="measure speed, success or settings")
     add_bench(bench.add_subparsers(dest="what", required=True))
@@ -78,8 +90,8 @@ def _parser() -> argparse.ArgumentParser:
     worlds = commands.add_parser("worlds", help="make random worlds around a robot")
     worlds.set_defaults(run=_worlds)
     add_robot(worlds)
-    worlds.add_argument("--num", type=int, default=6, help="worlds")
-    worlds.add_argument("--seed", type=int, default=0, help="before the first world's")
+    worlds.add_argument("--num", type=command.whole(1, 100_000), default=6, help="worlds")
+    worlds.add_argument("--seed", type=command.seed, default=0, help="before the first world's")
     worlds.add_argument("--out", required=True, help="folder for ROBOT_1.xml and so on")
     return parser
 
@@ -90,14 +102,15 @@ def _plan(arguments: argparse.Namespace) -> int:
 
     import vrrt_jax
     from vrrt_jax import report
+    from vrrt_jax.config import check_config
 
-    out = _writable(arguments.out)
-    problem = _problem(arguments)
     changes: dict[str, Any] = {"budget.time_limit_s": arguments.time_limit}
     if arguments.capacity is not None:
         changes["tree.capacity"] = arguments.capacity
     make = vrrt_jax.PlannerConfig.paper if arguments.paper else vrrt_jax.PlannerConfig
     config = make().changed(changes)
+    check_config(config)
+    problem, out = _problem(arguments), Path(arguments.out)
     print(f"{problem.name}: {problem.robot.name}, seed {arguments.seed}; compiling ...", flush=True)
     with tqdm(total=config.budget.max_iterations, unit="it", disable=None, leave=False) as bar:
 
@@ -116,7 +129,8 @@ def _plan(arguments: argparse.Namespace) -> int:
             on_progress=on_progress,
         )
     print(result)
-    report.save_result(problem, result, config, arguments.seed, out)
+    with command.or_printed(lambda: f"path: {json.dumps(result.path.tolist())}"):
+        report.save_result(problem, result, config, arguments.seed, out)
     if not arguments.no_pictures:
         _pictures(problem, result, out)
     if not result.ok:
@@ -138,10 +152,10 @@ def _pictures(problem, result, out: Path) -> None:
 
 
 def _problem(arguments: argparse.Namespace):
-    from vrrt_jax import problems
+    from vrrt_jax import checks, problems
     from vrrt_jax.robots import load_robot
-    from vrrt_jax.splat.images import read_image
     from vrrt_jax.splat.model import load_self_model
+    from vrrt_jax.splat.picture_file import read_image
 
     parts = ("robot", "world", "goal", "camera", "start")
     given = [name for name in parts if getattr(arguments, name) is not None]
@@ -162,6 +176,7 @@ def _problem(arguments: argparse.Namespace):
             f"{len(arguments.goal)} goal images but {len(arguments.camera)} cameras; give as many"
         )
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
+    checks.check_limits(robot, arguments.start, "start")
     images = tuple(read_image(path) for path in arguments.goal)
     return problems.Problem(
         name=Path(arguments.goal[0]).stem,
@@ -183,8 +198,8 @@ def _render(arguments: argparse.Namespace) -> int:
 
     from vrrt_jax import checks, problems
     from vrrt_jax.robots import load_robot
-    from vrrt_jax.splat.images import write_image
     from vrrt_jax.splat.mujoco_images import MeshRenderer
+    from vrrt_jax.splat.picture_file import write_image
 
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
     width, height = arguments.size
@@ -208,7 +223,6 @@ def _fit(arguments: argparse.Namespace) -> int:
     config = FitConfig(detail=arguments.detail)
     if arguments.images is not None:
         config = dataclasses.replace(config, num_images=arguments.images)
-    _writable(Path(arguments.out).parent)
     model = fit_self_model(robot, _meshes(robot), arguments.out, seed=arguments.seed, config=config)
     for level in (*model.levels, model.close_up):
         print(
@@ -227,7 +241,6 @@ def _spheres(arguments: argparse.Namespace) -> int:
 
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
     if arguments.out is not None:
-        _writable(Path(arguments.out).parent)
         Path(arguments.out).write_text(fit_spheres(robot, seed=arguments.seed, progress=print))
         print(f"wrote {arguments.out}")
         robot = load_robot(arguments.out)
@@ -261,7 +274,7 @@ def _meshes(robot):
 def _report(arguments: argparse.Namespace) -> int:
     from vrrt_jax.bench import tables
 
-    page = tables.write_page([Path(file) for file in arguments.files], _writable(arguments.out))
+    page = tables.write_page([Path(file) for file in arguments.files], Path(arguments.out))
     print(f"wrote {page}")
     return EXIT_SOLVED
 
@@ -270,7 +283,10 @@ def _worlds(arguments: argparse.Namespace) -> int:
     from vrrt_jax.bench.worlds import random_world, write_world
     from vrrt_jax.robots import load_robot
 
-    robot, out = load_robot(arguments.robot, freeze=arguments.freeze), _writable(arguments.out)
+    robot, out = (
+        load_robot(arguments.robot, freeze=arguments.freeze),
+        Path(arguments.out),
+    )
     for k in range(1, arguments.num + 1):
         seed = arguments.seed + k
         comment = f"Written by the command `vrrt worlds --robot {robot.name}`, seed {seed}."
@@ -279,25 +295,14 @@ def _worlds(arguments: argparse.Namespace) -> int:
     return EXIT_SOLVED
 
 
-def _writable(folder: str | Path) -> Path:
-    """The folder, made if need be; an error before any work if it cannot be written to."""
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise OSError(
-            f"cannot write to the folder '{folder}': {error.strerror}; choose another with --out"
-        ) from None
-    return folder
-
-
 def _size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
-    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a size such as 480x480")
-    return int(width), int(height)
+    sides = [int(side) if side.isascii() and side.isdigit() else 0 for side in (width, height)]
+    if not all(1 <= side <= LARGEST_SIDE for side in sides):
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is not a size such as 480x480, with sides up to {LARGEST_SIDE}"
+        )
+    return sides[0], sides[1]
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ class TreeConfig:
     """The tree: its size, and how it is rewired. Changes of the first four re-compile."""
 
     lanes: int = setting(32, 2, 4096)  # expansions an iteration
-    capacity: int = setting(8192, 8)  # nodes that there is room for at first
-    max_capacity: int = setting(1 << 20, 8)  # a full tree gets more room, up to this
+    capacity: int = setting(8192, 8, 1 << 24)  # nodes that there is room for at first
+    max_capacity: int = setting(1 << 20, 8, 1 << 24)  # a full tree gets more room, up to this
     image_px: int = setting(32, 8, 4096)  # image height that is searched at
     rewiring: bool = True  # RRT*, of the published planner
     rewire_radius: float = setting(0.3, 0.0)  # [rad]
@@ -86,7 +86,8 @@ class Budget:
     min_improvement: float = setting(0.0, 0.0)  # an improvement is a loss this much smaller ...
     min_ratio: float = setting(0.97, 0.0, 1.0)  # ... and below this share of the one before
     attempts: int = setting(2, 1, 1024)  # the later ones with other keys, without a verified path
-    time_limit_s: float = setting(float("inf"), 0.0)  # of all searches, compilation excluded [s]
+    # Of all searches, compilation excluded [s].
+    time_limit_s: float = setting(float("inf"), 0.0, endless=True)
     connect_iterations: int = setting(400, 1)  # of RRT-Connect, to a match
     shortcut_rounds: int = setting(150, 0)
     verify_step: float = setting(0.005, 1e-4, 1.0)  # between two configurations checked [rad]

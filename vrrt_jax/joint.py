@@ -11,18 +11,26 @@ import numpy as np
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.check_protocols import check_extracted_path
 from vrrt_jax.core.command import usable_cores
-from vrrt_jax.core.goal import ConfigurationGoal
+from vrrt_jax.core.goal import ConfigurationGoal, starts_at
 from vrrt_jax.core.interrupt import interruptible
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import ABORTED, STATUS_OF, PlanResult, Status, with_time_of
-from vrrt_jax.core.search import SearchResult, StopReason, make_termination, search
+from vrrt_jax.core.search import (
+    SearchResult,
+    StopReason,
+    make_termination,
+    no_search,
+    search,
+)
 from vrrt_jax.core.types import ExpansionPolicy
 from vrrt_jax.outcome import JOINT_ADVICE, Chosen, Progress, finish, time_left
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.world import World, keeping_clearance
+from vrrt_jax.scene.world import World, checked_more_finely, keeping_clearance
 
 WARY_SHARE = 0.15  # of the iterations are searched with a clearance to keep, then without
 
 
+@single_precision
 def plan_to_goal(
     robot: Robot,
     world: World,
@@ -35,7 +43,8 @@ def plan_to_goal(
 ) -> PlanResult:
     """Search, extract the policy's path, shorten and verify it; again, with another key, if not.
 
-    Random trees need many times longer now and then: beginning afresh is the cure for that.
+    Random trees need many times longer now and then: beginning afresh is the cure for that. After
+    a path that the exact check refused, edges are checked more finely.
 
     Args:
         robot: whose path it is.
@@ -56,6 +65,8 @@ def plan_to_goal(
             results.append(_attempt(robot, world, goal, policy, q_start, own_key, own, on_progress))
             if results[-1].ok or results[-1].status in ABORTED:
                 break
+            if results[-1].refused:
+                world = checked_more_finely(world)
     return with_time_of(results[-1], *results)
 
 
@@ -72,8 +83,13 @@ def _attempt(
     """One attempt, which keeps ``config.path.margin`` from everything if it can.
 
     It keeps less where start or goal are nearer than that. If no path is found soon, one is
-    searched for without.
+    searched for without. A plan that starts at its goal has nothing to search for.
     """
+    if starts_at(goal, world, q_start):
+        tree = policy.init(world, goal, q_start[None], config.tree.capacity)
+        chosen = _chosen(world, goal, q_start[None], q_start)
+        result = finish(robot, world, no_search(policy, tree), chosen, q_start, key, config)
+        return dataclasses.replace(result, advice=JOINT_ADVICE[result.status])
     wary = keeping_clearance(world, np.stack([q_start, goal.q]), config.path.margin)
     limit = config.budget.max_iterations
     # A planner that goes on to improve gets all of its iterations with the clearance.

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from vrrt_jax.config import PlannerConfig
+from vrrt_jax.core.edges import nearest_turn
 from vrrt_jax.core.postprocess import plan_result, postprocess, unchecked
 from vrrt_jax.core.result import EARLY_STOPS, STATUS_OF, PlanResult, Status
 from vrrt_jax.core.search import SearchResult
@@ -88,15 +89,17 @@ def finish(
             key=key,
             rounds=config.budget.shortcut_rounds,
         )
+    # The first thing that failed: without time nothing else is for certain, and without a match a
+    # path is not missed.
     matched = chosen.loss <= chosen.threshold
     if matched and done.is_verified:
         status = Status.SOLVED
     elif found.stopped in EARLY_STOPS:
         status = STATUS_OF[found.stopped]
-    elif chosen.path is None:
-        status = Status.NO_PATH
     elif not matched:
         status = STATUS_OF.get(found.stopped, Status.NO_MATCH)
+    elif chosen.path is None:
+        status = Status.NO_PATH
     else:
         status = Status.NOT_VERIFIED
     result = plan_result(
@@ -105,7 +108,7 @@ def finish(
         done,
         status=status,
         advice=ADVICE[status],
-        target=chosen.target,
+        target=nearest_turn(world, chosen.target, done.checked.path[-1]),
         loss=chosen.loss,
         match_threshold=chosen.threshold,
     )

@@ -14,6 +14,7 @@ from vrrt_jax.config import PlannerConfig, check_config
 from vrrt_jax.core.check_protocols import check_goal, check_policy
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners import PLANNERS, RRT, RRTStar
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import PlanResult
 from vrrt_jax.core.types import ExpansionPolicy, Goal
 from vrrt_jax.joint import plan_each_to_configuration, plan_to_goal
@@ -63,6 +64,7 @@ def plan(
     q_guess: np.ndarray | None = None,
     on_progress: Progress = None,
 ) -> PlanResult: ...
+@single_precision
 def plan(
     robot: Robot,
     world: World,
@@ -127,6 +129,7 @@ def plan(
     return plan_by_loss(robot, world, problem, policy, roots, key, config, on_progress)
 
 
+@single_precision
 def plan_to_configuration(
     robot: Robot,
     world: World,
@@ -191,6 +194,7 @@ def plan_batch(
     config: PlannerConfig | None = None,
     on_progress: Progress = None,
 ) -> list[PlanResult]: ...
+@single_precision
 def plan_batch(
     robot: Robot,
     world: World | Sequence[World],

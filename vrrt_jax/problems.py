@@ -2,20 +2,25 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vrrt_jax.core.fields import check_fields
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots import Robot, load_robot, robot_names, scenes_dir
 from vrrt_jax.scene.obstacles import load_obstacles
 from vrrt_jax.scene.world import World, build_world
-from vrrt_jax.splat.camera import camera_from_matrix, look_at
-from vrrt_jax.splat.images import read_image
+from vrrt_jax.splat.camera_fields import camera_from_dict
 from vrrt_jax.splat.model import SelfModel, load_self_model
+from vrrt_jax.splat.picture_file import read_image
 from vrrt_jax.splat.types import Camera
 from vrrt_jax.visual.goal import ImageGoal
+
+FIELDS = ("robot", "world", "self_model", "start", "views", "true_goal")  # of problem.json
+VIEW_FIELDS = ("image", "camera")  # of one of its views
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,6 +47,7 @@ def problem_names() -> list[str]:
     return sorted(p.parent.name for p in (scenes_dir() / "problems").glob("*/problem.json"))
 
 
+@single_precision
 def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
     """Load a packaged problem by name, or any by its folder.
 
@@ -51,7 +57,7 @@ def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
 
     Raises:
         FileNotFoundError: there is no such problem, or one of its files is missing.
-        ValueError: a file is damaged, a field is missing, or the engine does not exist.
+        ValueError: a file is damaged, a field is missing or unknown, or the engine does not exist.
     """
     folder = Path(name_or_path)
     if not (folder / "problem.json").is_file() and str(name_or_path) in problem_names():
@@ -63,11 +69,12 @@ def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
             "a folder with a problem.json"
         )
     fields = read_json(file)
+    check_fields(fields, FIELDS, f"'{file}'")
     try:
         robot = load_robot(_beside(folder, fields["robot"]))
         self_model = fields.get("self_model")
         self_model = None if self_model is None else _beside(folder, self_model)
-        views = fields["views"]
+        views = _checked_views(fields["views"], file)
         images = tuple(read_image(folder / view["image"]) for view in views)
         cameras = tuple(
             camera_from_dict(view["camera"], image.shape[:2])
@@ -87,6 +94,7 @@ def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
         raise ValueError(f"'{file}' lacks the field {error}; see the packaged problems") from None
 
 
+@single_precision
 def load_world(
     name_or_path: str | Path, robot: Robot, *, engine: str = "mjx", **settings: Any
 ) -> World:
@@ -131,60 +139,47 @@ def self_model_path(robot: Robot, given: str | Path | None = None) -> Path:
     return scenes_dir() / "robots" / robot.name / "self_model.npz"
 
 
-def camera_from_dict(fields: Mapping[str, Any], size: tuple[int, ...]) -> Camera:
-    """A camera from JSON, for images of a size (H, W).
-
-    Either ``position``, ``target`` and ``fovy_deg`` (and ``up``), or ``world_to_cam`` (4 x 4),
-    ``focal`` [px] and, unless it is in the middle, ``centre`` [px].
-
-    Raises:
-        ValueError: a field is missing or not a number.
-    """
-    height, width = size
-    try:
-        if "world_to_cam" in fields:
-            return camera_from_matrix(
-                np.array(fields["world_to_cam"], np.float64),
-                focal=float(fields["focal"]),
-                principal_point=fields.get("centre"),
-                height=height,
-                width=width,
-            )
-        return look_at(
-            fields["position"],
-            fields["target"],
-            fovy_deg=float(fields["fovy_deg"]),
-            up=fields.get("up", (0.0, 0.0, 1.0)),
-            height=height,
-            width=width,
-        )
-    except KeyError as error:
-        raise ValueError(
-            f"the camera lacks the field {error}; give position, target and fovy_deg, or "
-            "world_to_cam and focal"
-        ) from None
-    except TypeError as error:
-        raise ValueError(f"the camera has a field that is not a number: {error}") from None
-
-
 def read_json(path: str | Path) -> Any:
     """Read a JSON file.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not JSON, or truncated.
+        ValueError: not JSON, or truncated, or a field is there twice.
     """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        return json.loads(
+            Path(path).read_text(encoding="utf-8"), object_pairs_hook=_without_duplicates
+        )
     except OSError as error:
         raise FileNotFoundError(f"cannot read '{path}': {error.strerror}") from None
     except ValueError as error:
         raise ValueError(f"'{path}' is not valid JSON: {error}") from None
 
 
+def _checked_views(views: Any, file: Path) -> list[dict[str, Any]]:
+    """The views of a problem's file, each with an image and a camera.
+
+    Raises:
+        ValueError: there is none, or one has other fields.
+    """
+    if not isinstance(views, list) or not views:
+        raise ValueError(f"views of '{file}' is {views!r}; expected a list of images and cameras")
+    for index, view in enumerate(views):
+        check_fields(view, VIEW_FIELDS, f"view {index} of '{file}'")
+    return views
+
+
 def _beside(folder: Path, name: str) -> str:
     """A file of a problem's folder, if it is there; otherwise the name as it is."""
     return str(folder / name) if (folder / name).is_file() else name
+
+
+def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The fields of an object, or a ValueError: JSON would take the last of two silently."""
+    names = [name for name, _ in pairs]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"the field {', '.join(map(repr, twice))} is there twice")
+    return dict(pairs)
 
 
 def _vector(values: Sequence[float], what: str) -> np.ndarray:

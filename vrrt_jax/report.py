@@ -29,6 +29,7 @@ def summary(
         "advice": result.advice,
         "verified": bool(check is not None and check.ok),
         "verified_with": check.geometry if check is not None else None,
+        "refused": result.refused,
         "contact": check.contact if check is not None else None,
         "clearance_m": _number(result.clearance),
         "loss": result.loss,

@@ -18,7 +18,7 @@ from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.robots.mesh_sources import mesh_spec
 from vrrt_jax.scene.obstacles import signed_distances
 from vrrt_jax.scene.world import World, obstacle_list
-from vrrt_jax.splat.camera import project, shrunk
+from vrrt_jax.splat.camera import project, shrunk, squared
 from vrrt_jax.splat.images import prepare_goal
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.raster import render
@@ -166,7 +166,8 @@ def save_animation(
     Returns:
         Whether the robot is drawn with its true meshes.
     """
-    camera = shrunk(problem.cameras[0], max(1, round(problem.cameras[0].height / height)))
+    camera = squared(problem.cameras[0])
+    camera = shrunk(camera, max(1, round(camera.height / height)))
     painter = ScenePainter(problem.robot, problem.world, problem.self_model, camera)
     goal = _over_sky(problem.goal_images[0], (camera.width, camera.height))
     separator = np.full((camera.height, 4, 3), 255, np.uint8)
@@ -235,7 +236,8 @@ def save_figure(problem: Problem, result: PlanResult, path: str | Path) -> None:
 
 def _draw_images(figure, grid, problem: Problem, result: PlanResult) -> None:
     """The upper row: start, goal image, rendered end, and difference."""
-    camera = shrunk(problem.cameras[0], max(1, round(problem.cameras[0].height / 240)))
+    camera = squared(problem.cameras[0])
+    camera = shrunk(camera, max(1, round(camera.height / 240)))
     goal, _ = prepare_goal([problem.goal_images[0]], [problem.cameras[0]], camera.height)
     painter = ScenePainter(problem.robot, problem.world, problem.self_model, camera)
     splats = problem.self_model.level_for(camera.height).splats

@@ -1,7 +1,7 @@
 """The ``nrp bench checks`` command: speed and errors of collision checks.
 
 Three methods check the same random configurations: the batched check of the planners; a loop in
-numpy over the same spheres, with exact distances to cells; and C MuJoCo, with the robot's geoms and
+numpy over the same shapes; and C MuJoCo, with the robot's geoms and
 the cells as boxes. The latter two are exact. A collision that one of them finds and the batched
 check does not is a missed collision.
 """
@@ -18,6 +18,7 @@ from nrp_jax.homes.grid import Grid, load_map
 from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.robots import MobileRobot, load_robot
 from nrp_jax.scene.world import batch_is_free, build_world
+from vrrt_jax.core import command
 from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.timing import best_ms, machine
 from vrrt_jax.robots.kinematics import batch_link_poses
@@ -40,7 +41,6 @@ class SphereLoop:
         self.link = np.asarray(robot.collision_spheres.link)
         self.center = np.asarray(robot.collision_spheres.center, float)
         self.radius = np.asarray(robot.collision_spheres.radius, float)
-        self.pairs = np.asarray(robot.self_collision_pairs)
         self.chain = [
             np.asarray(getattr(robot.chain, name), float)
             for name in ("constant", "cosine", "sine", "slide")
@@ -50,15 +50,11 @@ class SphereLoop:
 
     def is_free(self, q: np.ndarray) -> bool:
         """Whether ``q`` (D,) is free."""
-        # The spheres' centers, and the robot against itself.
+        # The robot against itself, and the spheres' centers.
         pose = self.poses(q)
         turned = pose[self.link]
         center = np.einsum("nij,nj->ni", turned[:, :3, :3], self.center) + turned[:, :3, 3]
-        first, second = self.pairs.T
-        apart = np.linalg.norm(center[first] - center[second], axis=1)
-        if (apart < self.radius[first] + self.radius[second]).any():
-            return False
-        if planar_boxes_overlap(self.robot, pose):
+        if planar_boxes_overlap(self.robot, pose) or shapes_overlap(self.robot, pose):
             return False
         # The arm against the floor, all spheres against the cells, and the base.
         if (center[self.is_arm, 2] <= self.radius[self.is_arm]).any():
@@ -135,6 +131,45 @@ def planar_boxes_overlap(robot: MobileRobot, poses: np.ndarray) -> bool:
     return False
 
 
+def shapes_overlap(robot: MobileRobot, poses: np.ndarray) -> bool:
+    """Whether checked capsules and boxes overlap: the nearest points of each pair by trisection."""
+    shapes = robot.shapes
+    if shapes is None:
+        return False
+    num, radius = len(shapes.link), np.asarray(shapes.radius)
+    ends = (poses[:, :3].reshape(-1) @ np.asarray(shapes.ends, float)).reshape(3, -1).T
+    start, axis = ends[:num], ends[num:] - ends[:num]
+
+    def to_segment(point: np.ndarray, capsule: np.ndarray) -> np.ndarray:
+        beside, along = point - start[capsule], axis[capsule]
+        share = (beside * along).sum(1) / np.maximum((along**2).sum(1), 1e-12)
+        return np.linalg.norm(beside - np.clip(share, 0, 1)[:, None] * along, axis=1)
+
+    def to_box(point: np.ndarray, box: np.ndarray) -> np.ndarray:
+        pose = poses[np.array(shapes.box_link)[box]]
+        turned = pose[:, :3, :3] @ np.asarray(shapes.box_rotation, float)[box]
+        middle = np.einsum("nij,nj->ni", pose[:, :3, :3], np.asarray(shapes.box_center)[box])
+        local = np.einsum("nji,nj->ni", turned, point - middle - pose[:, :3, 3])
+        half = np.asarray(shapes.box_half, float)[box]
+        return np.linalg.norm(local - np.clip(local, -half, half), axis=1)
+
+    first, second = np.array(shapes.pairs).T
+    capsule, box = np.array(shapes.box_pairs).T
+    apart = _trisect(lambda t: to_segment(start[first] + t[:, None] * axis[first], second), first)
+    boxed = _trisect(lambda t: to_box(start[capsule] + t[:, None] * axis[capsule], box), capsule)
+    return bool((apart < radius[first] + radius[second]).any() or (boxed < radius[capsule]).any())
+
+
+def _trisect(distance: Callable[[np.ndarray], np.ndarray], pairs: np.ndarray) -> np.ndarray:
+    """Least values (P,) of convex functions of a number in [0, 1]."""
+    low, high = np.zeros(len(pairs)), np.ones(len(pairs))
+    for _ in range(40):
+        left, right = low + (high - low) / 3, high - (high - low) / 3
+        rises = distance(left) < distance(right)
+        low, high = np.where(rises, low, left), np.where(rises, right, high)
+    return distance((low + high) / 2)
+
+
 def run(robot: MobileRobot, grid: Grid, num: int = 10_000, timed: int = 500) -> dict:
     """Compare the three methods on random configurations of a map.
 
@@ -194,7 +229,9 @@ def add_arguments(subparsers) -> None:
     parser = subparsers.add_parser("checks", help="configuration checks: rate and errors")
     parser.set_defaults(run=_run_command)
     parser.add_argument("--map", help="a map; a random home by default")
-    parser.add_argument("--num", type=int, default=10_000, help="configurations compared")
+    parser.add_argument(
+        "--num", type=command.whole(1, 10_000_000), default=10_000, help="configurations compared"
+    )
     parser.add_argument("--json", help="write the figures here")
 
 

@@ -17,6 +17,7 @@ from nrp_jax.planner import KINDS, PLANNERS, PlanResult, Status, plan
 from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.robots import MobileRobot, load_robot
 from nrp_jax.scene.world import GridWorld, build_world
+from vrrt_jax.core import command
 from vrrt_jax.core.interrupt import uninterrupted
 from vrrt_jax.core.timing import machine
 
@@ -78,7 +79,8 @@ def run(
 
     Returns:
         ``n``, ``success`` (share), ``median_search_s``, ``median_expansions`` and ``mean_cost_m``
-        (both of the solved queries), ``not_verified`` (number of paths that C MuJoCo refuses).
+        (both of the solved queries), ``refused_paths`` (by C MuJoCo, in all plans) and
+        ``not_verified`` (number of plans that end with one).
 
     Raises:
         KeyboardInterrupt: a search was interrupted.
@@ -111,6 +113,7 @@ def run(
         "median_search_s": round(float(np.median([r.timing["search_s"] for r in results])), 4),
         "median_expansions": float(np.median([r.expansions for r in solved])) if solved else None,
         "mean_cost_m": round(float(np.mean([r.cost for r in solved])), 3) if solved else None,
+        "refused_paths": sum(r.refused for r in results),
         "not_verified": sum(r.status is Status.NOT_VERIFIED for r in results),
     }
 
@@ -121,14 +124,22 @@ def add_arguments(subparsers: Any) -> None:
     parser.set_defaults(run=_run_command)
     parser.add_argument("--task", default="snake", choices=tuple(CELLS), help="whose homes")
     parser.add_argument("--methods", default=",".join(PLANNERS), help="some of the default's")
-    parser.add_argument("--homes", type=int, default=5, help="unseen ones")
-    parser.add_argument("--queries", type=int, default=10, help="of a home")
-    parser.add_argument("--max-expansions", type=int, default=EXPANSIONS, help="of a plan")
-    parser.add_argument("--lanes", type=int, default=10, help="expansions at a time")
-    parser.add_argument("--goal-bias", type=float, default=0.1, help="share that aims there")
+    parser.add_argument("--homes", type=command.whole(1, 100_000), default=5, help="unseen ones")
+    parser.add_argument("--queries", type=command.whole(1, 100_000), default=10, help="of a home")
+    parser.add_argument(
+        "--max-expansions", type=command.whole(1, 2**31 - 1), default=EXPANSIONS, help="of a plan"
+    )
+    parser.add_argument(
+        "--lanes", type=command.whole(1, 4096), default=10, help="expansions at a time"
+    )
+    parser.add_argument(
+        "--goal-bias", type=command.real(0.0, 1.0), default=0.1, help="share that aims there"
+    )
     parser.add_argument("--discriminator", help="what nrp train wrote; packaged by default")
     parser.add_argument("--cvae", help="what nrp train wrote; packaged by default")
-    parser.add_argument("--seed", type=int, default=0, help="of the homes, as for nrp data")
+    parser.add_argument(
+        "--seed", type=command.whole(0, 100_000), default=0, help="of the homes, as for nrp data"
+    )
     parser.add_argument("--json", help="write the figures here")
 
 

@@ -26,6 +26,7 @@ from nrp_jax.learning.roadmap import Roadmap, build_roadmap, load_roadmap
 from nrp_jax.learning.shards import VERSION, home_seed
 from nrp_jax.scene.robots import MobileRobot, load_robot
 from nrp_jax.scene.world import GridWorld, build_world
+from vrrt_jax.core import command
 from vrrt_jax.core.timing import machine
 
 LANES = 32  # waypoints proposed at a time, as a planner asks for them
@@ -146,8 +147,10 @@ def add_arguments(subparsers: Any) -> None:
         action="store_true",
         help="take the networks' first choice, as the paper does, whether its edge is free or not",
     )
-    parser.add_argument("--queries", type=int, default=50, help="of a home")
-    parser.add_argument("--nodes", type=int, default=10_000, help="of a home's roadmap")
+    parser.add_argument("--queries", type=command.whole(1, 1_000_000), default=50, help="of a home")
+    parser.add_argument(
+        "--nodes", type=command.whole(500, 1_000_000), default=10_000, help="of a home's roadmap"
+    )
     parser.add_argument("--json", help="write the figures here")
 
 

@@ -7,6 +7,9 @@ import numpy as np
 
 from nrp_jax.homes.furniture import HEIGHT
 from nrp_jax.homes.houses import CELLS, House, generate_house
+from vrrt_jax.core import command
+
+_MAX_PIXELS = 20_000  # along the longer side of a figure
 
 
 def save_figure(houses: list[House], path: str | Path) -> None:
@@ -18,7 +21,8 @@ def save_figure(houses: list[House], path: str | Path) -> None:
 
     columns = min(5, len(houses))
     rows = -(-len(houses) // columns)
-    figure, axes = pyplot.subplots(rows, columns, figsize=(3.2 * columns, 3.3 * rows), dpi=110)
+    dpi = min(110, _MAX_PIXELS / (3.3 * rows))
+    figure, axes = pyplot.subplots(rows, columns, figsize=(3.2 * columns, 3.3 * rows), dpi=dpi)
     axes = np.ravel(axes)
     for axis in axes:
         axis.axis("off")
@@ -55,16 +59,16 @@ def _draw(axis, house: House) -> None:
 def add_arguments(subparsers) -> None:
     """Add the ``homes`` command to a command line."""
     parser = subparsers.add_parser("homes", help="draw random homes")
-    parser.set_defaults(run=_run)
-    parser.add_argument("--num", type=int, default=20, help="homes")
-    parser.add_argument("--seed", type=int, default=0, help="of the first; the others follow")
+    parser.set_defaults(run=_run, out_is_file=True)
+    parser.add_argument("--num", type=command.whole(1, 1000), default=20, help="homes")
+    parser.add_argument(
+        "--seed", type=command.seed, default=0, help="of the first; the others follow"
+    )
     parser.add_argument("--task", default="snake", choices=tuple(CELLS), help="whose homes")
     parser.add_argument("--out", required=True, help="a .png file")
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    if arguments.num < 1:
-        raise ValueError(f"--num is {arguments.num}; expected at least 1")
     seeds = range(arguments.seed, arguments.seed + arguments.num)
     houses = [generate_house(seed, arguments.task) for seed in seeds]
     save_figure(houses, arguments.out)

@@ -3,15 +3,10 @@
 import dataclasses
 from pathlib import Path
 
-import mujoco
 import numpy as np
-import yaml
-from PIL import Image, UnidentifiedImageError
 
 RESOLUTION = 0.1  # side of the cells that planners and networks expect [m]
 HEIGHT = 2.0  # of the maps [m]; homes end there
-_UNKNOWN = 0.196  # just below the occupancy of ROS's gray 205, which stands for unknown
-_PROBE = "cell"  # name of the box that stands for a cell in MuJoCo
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,152 +108,150 @@ class Grid:
         )
 
 
-def load_map(path: str | Path) -> Grid:
+def load_map(path: str | Path, *, crop: tuple[float, float, float, float] | None = None) -> Grid:
     """Read a map.
 
     Args:
-        path: ``.npz`` with ``occupied``, ``resolution_m`` and ``origin_m``; a ROS map's ``.yaml``
-            of mode trinary or scale (unknown and transparent pixels count as solid); or an MJCF
-            scene ``.xml``, which is cut into cells. Cells smaller than 0.1 m are joined.
+        path: ``.npz`` with ``occupied``, ``resolution_m`` and ``origin_m``; a ROS map's ``.yaml``,
+            read as map_server does (what is not known to be free is solid); or an MJCF scene
+            ``.xml``, which is cut into cells. Cells smaller than 0.1 m are joined.
+        crop: x0, y0, x1, y1 of the part to read [m], rounded to cells; all of it if None.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is of another kind or malformed.
+        ValueError: the file is of another kind, malformed or too large for the memory, or nothing
+            of the map lies in ``crop``.
     """
+    from nrp_jax.homes.mjcf_map import read_mjcf_map
+    from nrp_jax.homes.ros_map import read_ros_map
+
     path = Path(path).expanduser()
     if not path.is_file():
         raise FileNotFoundError(f"map '{path}' does not exist (or is a folder)")
-    readers = {".npz": _read_npz, ".yaml": _read_ros, ".yml": _read_ros, ".xml": _read_mjcf}
+    readers = {
+        ".npz": _read_npz,
+        ".yaml": read_ros_map,
+        ".yml": read_ros_map,
+        ".xml": read_mjcf_map,
+    }
     if path.suffix not in readers:
         raise ValueError(f"map '{path}': unknown kind; expected one of {', '.join(readers)}")
+    if crop is not None and (len(crop) != 4 or not np.isfinite(crop).all()):
+        raise ValueError(f"crop is {crop}; expected four numbers x0, y0, x1, y1 [m]")
     try:
-        return coarsened(readers[path.suffix](path))
+        grid = readers[path.suffix](path, crop)
+        return grid if crop is None else grid.crop(crop[:2], crop[2:])
     except ValueError as error:
         raise ValueError(f"map '{path}': {error}") from error
+    except MemoryError as error:
+        raise ValueError(f"map '{path}': too little memory; read a part of it, see crop") from error
 
 
-def coarsened(grid: Grid, resolution: float = RESOLUTION) -> Grid:
+def coarsened(grid: Grid, resolution: float = RESOLUTION, *, cells: int | None = None) -> Grid:
     """The map in larger cells, solid where any part of them is, or lies beside the map.
+
+    Args:
+        grid: a map of smaller cells.
+        resolution: side of the larger cells [m].
+        cells: of the longer side of the whole map, where this is a part of it.
 
     Raises:
         ValueError: the cells are larger already.
     """
-    if abs(grid.resolution - resolution) < 1e-6:
-        return grid
-    if grid.resolution > resolution:
+    p, q = _ratio(grid.resolution, resolution, max(grid.occupied.shape) if cells is None else cells)
+    if p > q:
         raise ValueError(
-            f"the map's cells are {grid.resolution} m, but planning needs {resolution} m or less: "
-            "scan or draw it finer"
+            f"the map's cells are {grid.resolution:g} m, but planning needs {resolution} m or "
+            "less: scan or draw it finer"
         )
-    # Axis by axis: a small cell makes the large cells solid that hold its first and last edge.
-    ratio = grid.resolution / resolution
-    axes = 2 if grid.planar else 3
+    # Axis by axis: a large cell is solid if one of the small cells in it is. In whole numbers, a
+    # small cell is p long and a large one q, so that nothing is rounded.
     occupied = grid.occupied
-    for axis in range(axes):
-        cells = np.moveaxis(occupied, axis, 0)
-        size = cells.shape[0] * ratio
-        coarse = np.zeros((int(np.ceil(size - 1e-6)), *cells.shape[1:]), bool)
-        edges = np.arange(cells.shape[0] + 1) * ratio
-        np.logical_or.at(coarse, np.floor(edges[:-1] + 1e-6).astype(int), cells)
-        np.logical_or.at(coarse, np.ceil(edges[1:] - 1e-6).astype(int) - 1, cells)
+    for axis in range(2 if grid.planar else 3):
+        num = occupied.shape[axis]
+        large = np.arange(-(-num * p // q))
+        first, end = large * q // p, np.minimum(-(-(large + 1) * q // p), num)
+        coarse = np.take(occupied, first, axis)
+        for k in range(1, int((end - first).max())):
+            coarse |= np.take(occupied, np.minimum(first + k, end - 1), axis)
         # The last large cell may lie partly beside the map, where all is solid.
-        if axis < 2 and size < len(coarse) - 1e-6:
-            coarse[-1] = True
-        occupied = np.moveaxis(coarse, 0, axis)
+        if axis < 2 and num * p % q:
+            np.moveaxis(coarse, axis, 0)[-1] = True
+        occupied = coarse
     return dataclasses.replace(grid, occupied=occupied, resolution=resolution)
 
 
-def _read_npz(path: Path) -> Grid:
+def _ratio(small: float, large: float, cells: int) -> tuple[int, int]:
+    """The simplest fraction p / q that is the ratio of two sides, or nearly.
+
+    Files hold rounded numbers, as 0.0500000007 of float32. Over all cells of a map the fraction is
+    wrong by a twentieth of a small cell at most.
+    """
+    ratio = small / large
+    for q in range(1, 1_000_000):
+        p = max(round(ratio * q), 1)
+        if abs(p / q - ratio) * cells <= 0.05 * ratio:
+            return p, q
+    raise ValueError(f"the map's cells of {small} m are too small to be joined to {large} m")
+
+
+def part_of(
+    shape: tuple[int, int],
+    resolution: float,
+    origin: tuple[float, ...],
+    crop: tuple[float, float, float, float] | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """First and last index + 1, (2,) each, of the small cells that a part is made of.
+
+    The part is a little larger than asked for, so that it begins where a large cell does.
+
+    Raises:
+        ValueError: nothing of the map lies in it.
+    """
+    if crop is None:
+        return np.zeros(2, int), np.array(shape)
+    _, q = _ratio(resolution, RESOLUTION, max(shape))
+    blocks = (np.array(crop).reshape(2, 2) - origin) / (resolution * q)
+    first, last = np.floor(blocks[0]) - 1, np.ceil(blocks[1]) + 1
+    first, last = (np.clip(index * q, 0, shape).astype(int) for index in (first, last))
+    if not (first < last).all():
+        high = np.array(origin) + np.array(shape) * resolution
+        raise ValueError(
+            f"nothing of the map lies in the crop {tuple(crop)}; it spans {tuple(origin)} to "
+            f"{tuple(high.tolist())} m"
+        )
+    return first, last
+
+
+def _read_npz(path: Path, crop: tuple[float, float, float, float] | None) -> Grid:
     try:
         with np.load(path, allow_pickle=False) as data:
             arrays = dict(data)
+    except MemoryError:
+        raise
     except Exception as error:  # numpy and zipfile raise many kinds
         raise ValueError(f"it is not a readable .npz file: {error}") from error
+    known = ("occupied", "resolution_m", "origin_m")
     if "occupied" not in arrays:
         raise ValueError(f"it has no array 'occupied', only: {', '.join(arrays)}")
-    origin = tuple(np.ravel(arrays.get("origin_m", np.zeros(3))).tolist())
-    resolution = np.ravel(arrays.get("resolution_m", RESOLUTION))
-    if len(resolution) != 1:
+    if unknown := sorted({*arrays} - {*known}):
+        raise ValueError(f"it has unknown arrays {', '.join(unknown)}; expected {', '.join(known)}")
+    for name, array in arrays.items():
+        if array.dtype.kind not in ("biuf" if name == "occupied" else "iuf"):
+            raise ValueError(f"its {name} is of type {array.dtype}; expected numbers")
+    origin, resolution = arrays.get("origin_m", np.zeros(3)), arrays.get("resolution_m", RESOLUTION)
+    if np.size(resolution) != 1:
         raise ValueError(f"its resolution_m is {resolution.tolist()}; expected one number")
-    return Grid(occupied=arrays["occupied"], resolution=float(resolution[0]), origin=origin)
-
-
-def _read_ros(path: Path) -> Grid:
-    """A planar map of ROS's map_server: gray values, the top row at the largest y."""
-    try:
-        about = yaml.safe_load(path.read_text())
-        resolution, origin = float(about["resolution"]), [float(v) for v in about["origin"]]
-        occupied_from = float(about.get("occupied_thresh", 0.65))
-        free_below = min(float(about.get("free_thresh", _UNKNOWN)), _UNKNOWN)
-        image = Image.open(path.parent / about["image"])
-        gray = np.asarray(image.convert("L"), float) / 255
-    except (KeyError, TypeError, ValueError, yaml.YAMLError, UnidentifiedImageError) as error:
-        raise ValueError(
-            f"it is not a map_server file with image, resolution and origin: {error!r}"
-        ) from error
-    if len(origin) > 2 and origin[2]:
-        raise ValueError(f"it is turned by {origin[2]} rad; rotate the image and set yaw to 0")
-    mode = about.get("mode", "trinary")
-    if mode not in ("trinary", "scale"):
-        raise ValueError(f"its mode is '{mode}'; expected 'trinary': save the map as trinary")
-    if image.mode.startswith(("I", "F")):
-        raise ValueError(
-            f"its image has pixels of kind '{image.mode}'; expected 8 bits a pixel: convert it"
-        )
-    # Gray values are occupancies, unless negated: dark is solid. Transparent pixels are unknown.
-    if not about.get("negate", 0):
-        gray = 1 - gray
-    clear = np.asarray(image.convert("RGBA").getchannel("A")) < 255
-    solid = ~(gray < free_below) | (gray > occupied_from) | clear  # unknown is solid
-    return Grid(occupied=solid[::-1].T, resolution=resolution, origin=(origin[0], origin[1], 0.0))
-
-
-def _read_mjcf(path: Path) -> Grid:
-    """Cut the geoms of a scene into cells, from the floor at z = 0 up to 2 m; planes are left out.
-
-    A cell is solid if its inside touches a geom.
-    """
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        half = RESOLUTION / 2 * (1 - 1e-3)
-        spec.worldbody.add_geom(name=_PROBE, type=mujoco.mjtGeom.mjGEOM_BOX, size=[half] * 3)
-        model = spec.compile()
-    except ValueError as error:
-        raise ValueError(f"MuJoCo cannot compile it: {error}") from error
-    # The geoms that can be collided with, at their places.
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    probe = model.geom(_PROBE).id
-    data.geom_xmat[probe] = np.eye(3).ravel()
-    geoms = np.flatnonzero(
-        (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
-        & (model.geom_contype | model.geom_conaffinity > 0)
-        & (np.arange(model.ngeom) != probe)
+    if np.shape(origin) not in ((2,), (3,)):
+        raise ValueError(f"its origin_m has shape {np.shape(origin)}; expected (3,): x, y, z in m")
+    grid = Grid(
+        occupied=arrays["occupied"],
+        resolution=float(np.ravel(resolution)[0]),
+        origin=tuple(origin.tolist()),
     )
-    if not len(geoms):
-        raise ValueError("the scene has no geom to collide with but planes")
-    # A grid around all of them, in cells of 0.1 m.
-    boxes = [_bounds(model, data, int(g)) for g in geoms]
-    low = np.append(np.min([b[0] for b in boxes], axis=0)[:2], 0.0)
-    high = np.append(np.max([b[1] for b in boxes], axis=0)[:2], HEIGHT)
-    first = np.floor(low / RESOLUTION + 1e-6).astype(int)
-    shape = np.ceil(high / RESOLUTION - 1e-6).astype(int) - first
-    occupied = np.zeros(shape, bool)
-    # Move the box to each cell near a geom: does it touch the geom?
-    for geom, (lower, upper) in zip(geoms, boxes, strict=True):
-        start = np.clip(np.floor(lower / RESOLUTION + 1e-6).astype(int) - first, 0, shape)
-        stop = np.clip(np.ceil(upper / RESOLUTION - 1e-6).astype(int) - first, 0, shape)
-        for index in np.ndindex(*np.maximum(stop - start, 0)):
-            cell = start + index
-            data.geom_xpos[probe] = (first + cell + 0.5) * RESOLUTION
-            if mujoco.mj_geomDistance(model, data, probe, geom, RESOLUTION, None) <= 0:
-                occupied[tuple(cell)] = True
-    return Grid(occupied=occupied, origin=tuple((first * RESOLUTION).tolist()))
-
-
-def _bounds(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (3,) and (3,) of a geom's bounding box in the world [m]."""
-    rotation = data.geom_xmat[geom].reshape(3, 3)
-    center = data.geom_xpos[geom] + rotation @ model.geom_aabb[geom, :3]
-    reach = np.abs(rotation) @ model.geom_aabb[geom, 3:]
-    return center - reach, center + reach
+    shape = grid.occupied.shape[:2]
+    first, last = part_of(shape, grid.resolution, grid.origin[:2], crop)
+    x, y = np.array(grid.origin[:2]) + first * grid.resolution
+    part = grid.occupied[first[0] : last[0], first[1] : last[1]]
+    grid = dataclasses.replace(grid, occupied=part, origin=(x, y, grid.origin[2]))
+    return coarsened(grid, cells=max(shape))

@@ -14,6 +14,7 @@ import numpy as np
 
 from nrp_jax.learning.models import CVAE, Discriminator, ModelConfig
 from vrrt_jax.core.files import replacing
+from vrrt_jax.core.precision import single_precision
 
 VERSION = 2  # of the features that networks see; models of other versions are refused
 
@@ -50,6 +51,7 @@ def save_model(model: Model, path: str | Path) -> None:
         np.savez_compressed(handle, description=np.array(description), **arrays)
 
 
+@single_precision
 def load_model(path: str | Path) -> Model:
     """Read a model that :func:`save_model` wrote.
 

@@ -24,8 +24,10 @@ from nrp_jax.learning.shards import (
     make_shards,
     shard_name,
 )
+from vrrt_jax.core import command
 from vrrt_jax.core.command import usable_cores
 from vrrt_jax.core.files import UNFINISHED, replacing
+from vrrt_jax.core.precision import single_precision
 
 MANIFEST = "manifest.json"
 
@@ -45,6 +47,7 @@ class Dataset:
         return len(self.rows["ratio"])
 
 
+@single_precision
 def write_dataset(
     out: str | Path,
     settings: DatasetSettings,
@@ -90,6 +93,7 @@ def write_dataset(
     return manifest
 
 
+@single_precision
 def load_dataset(folder: str | Path, split: str = "train") -> Dataset:
     """Read a split.
 
@@ -228,13 +232,25 @@ def add_arguments(subparsers) -> None:
     parser.set_defaults(run=_run_command)
     parser.add_argument("--task", required=True, choices=tuple(houses.CELLS), help="whose rows")
     parser.add_argument("--out", required=True, help="folder")
-    parser.add_argument("--homes", type=int, default=25, help="for training")
-    parser.add_argument("--test-homes", type=int, default=5, help="apart, for tests")
-    parser.add_argument("--queries", type=int, default=default.queries, help="of a home")
-    parser.add_argument("--waypoints", type=int, default=default.waypoints, help="of a query")
-    parser.add_argument("--nodes", type=int, default=default.nodes, help="of a roadmap")
-    parser.add_argument("--seed", type=int, default=0, help="of homes, roadmaps and rows")
-    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes")
+    parser.add_argument("--homes", type=command.whole(1, 100_000), default=25, help="for training")
+    parser.add_argument(
+        "--test-homes", type=command.whole(0, 100_000), default=5, help="apart, for tests"
+    )
+    parser.add_argument(
+        "--queries", type=command.whole(1, 1_000_000), default=default.queries, help="of a home"
+    )
+    parser.add_argument(
+        "--waypoints", type=command.whole(1, 10_000), default=default.waypoints, help="of a query"
+    )
+    parser.add_argument(
+        "--nodes", type=command.whole(1, 1_000_000), default=default.nodes, help="of a roadmap"
+    )
+    parser.add_argument(
+        "--seed", type=command.whole(0, 100_000), default=0, help="of homes, roadmaps and rows"
+    )
+    parser.add_argument(
+        "--jobs", type=command.whole(1, 1024), default=usable_cores(), help="processes"
+    )
 
 
 def _run_command(arguments: argparse.Namespace) -> int:

@@ -21,6 +21,7 @@ from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld, batch_is_free, build_world
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners.rrt import RRT, sample_configurations
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.search import StopReason, initial_state, make_termination, run_chunk
 
 EXPANSIONS = 300  # of RRT-IS for a query
@@ -33,6 +34,7 @@ RRT_IS = RRT(
 )
 
 
+@single_precision
 def difficulty(robot: MobileRobot, grid: Grid, num: int = 20, seed: int = 0) -> float:
     """Measure the share of random long queries in a home that RRT-IS solves; lower is harder.
 
@@ -48,6 +50,7 @@ def difficulty(robot: MobileRobot, grid: Grid, num: int = 20, seed: int = 0) -> 
     return float(np.mean(list(_answers(robot, grid, num, seed))))
 
 
+@single_precision
 def is_fair(robot: MobileRobot, grid: Grid, num: int = 20, seed: int = 0) -> bool:
     """Tell whether the difficulty of a home is within ``FAIR``, from as few queries as tell it.
 
@@ -73,6 +76,7 @@ def _answers(robot: MobileRobot, grid: Grid, num: int, seed: int) -> Iterator[bo
         yield bool(is_solved(world, *query))
 
 
+@single_precision
 def fair_house(robot: MobileRobot, seed: int) -> House:
     """Generate the first fair home of a seed.
 
@@ -89,6 +93,7 @@ def fair_house(robot: MobileRobot, seed: int) -> House:
     raise RuntimeError(f"no home of seed {seed} is neither too hard nor too easy; take another")
 
 
+@single_precision
 def long_queries(
     robot: MobileRobot, world: GridWorld, grid: Grid, num: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -15,6 +15,7 @@ from nrp_jax.learning.edge_check import check_edges
 from nrp_jax.learning.roadmap import Extents, Roadmap
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld
+from vrrt_jax.core.precision import single_precision
 
 GOOD_RATIO = 1.1  # a waypoint is good if the path through it is at most this times the shortest
 STARTS_PER_GOAL = 10
@@ -38,6 +39,7 @@ class Rows:
     query: np.ndarray  # (n,) i32, rows of one query follow each other
 
 
+@single_precision
 def make_rows(
     world: GridWorld,
     robot: MobileRobot,

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax.learning.models import ModelConfig
-from nrp_jax.scene.field import DistanceField
+from nrp_jax.scene.field import FINE, DistanceField
 from nrp_jax.scene.robots import MobileRobot
 from vrrt_jax.core.edges import short_way
 
@@ -138,10 +138,9 @@ def surroundings(field: DistanceField) -> jax.Array:
     """
     planar = field.values.shape[2] == 1
     # The lattice points at the centers of the cells; the field has a rim of one cell in x and y.
-    fine = field.fine
-    first = fine + fine // 2
-    inside = field.values[first:-first:fine, first:-first:fine]
-    return jnp.minimum(inside if planar else inside[:, :, fine // 2 :: fine], MAX_CLEARANCE)
+    first = FINE + FINE // 2
+    inside = field.values[first:-first:FINE, first:-first:FINE]
+    return jnp.minimum(inside if planar else inside[:, :, FINE // 2 :: FINE], MAX_CLEARANCE)
 
 
 def turn_image(image: jax.Array, quarter: jax.Array, mirror: jax.Array) -> jax.Array:

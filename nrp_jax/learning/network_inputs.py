@@ -42,10 +42,10 @@ def network_inputs(
         q_from: (B, D) starts in the map.
         q_goal: (B, D) goals in the map.
     """
-    # The image around each start. The field has a rim of one cell, which the map has not.
+    # The image around each start.
     padded = surrounding_map(config, world.field)
     resolution = world.field.resolution
-    origin = world.field.origin[:2] + resolution
+    origin = world.corner[0]
     image, center = jax.vmap(lambda q: local_image(config, padded, q, resolution, origin))(q_from)
     # Both ends in the local frame, so that a model learns one place for all.
     ends = jnp.stack([q_from, q_goal], axis=1)

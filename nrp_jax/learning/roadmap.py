@@ -21,6 +21,7 @@ from nrp_jax.scene.robots import MobileRobot, batch_link_features
 from nrp_jax.scene.world import GridWorld, batch_is_free
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.planners.rrt import sample_configurations
+from vrrt_jax.core.precision import single_precision
 
 # A local window reaches 2 m from its center, which is rounded to cells: half a cell less is safe.
 HALF_WINDOW = 1.95  # [m]
@@ -44,6 +45,7 @@ class Roadmap:
             np.savez(handle, q=self.q, colliding=self.colliding, **graph)
 
 
+@single_precision
 def load_roadmap(path: Path) -> Roadmap:
     """Read a roadmap that :meth:`Roadmap.save` wrote."""
     with np.load(path) as saved:
@@ -55,6 +57,7 @@ def load_roadmap(path: Path) -> Roadmap:
         )
 
 
+@single_precision
 def build_roadmap(
     world: GridWorld,
     robot: MobileRobot,

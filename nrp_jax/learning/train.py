@@ -29,6 +29,8 @@ from nrp_jax.learning.training_io import (
     write_log,
 )
 from nrp_jax.scene.robots import MobileRobot, load_robot
+from vrrt_jax.core import command
+from vrrt_jax.core.precision import single_precision
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -45,6 +47,7 @@ class TrainConfig:
     seed: int = 0
 
 
+@single_precision
 def train(
     config: ModelConfig,
     robot: MobileRobot,
@@ -225,16 +228,28 @@ def add_arguments(subparsers: Any) -> None:
     )
     parser.add_argument("--data", required=True, help="folder that nrp data wrote")
     parser.add_argument("--out", required=True, help="folder for the model, log and curves")
-    parser.add_argument("--epochs", type=int, default=TrainConfig.epochs, help="at most")
-    parser.add_argument("--batch", type=int, default=TrainConfig.batch, help="queries a step")
     parser.add_argument(
-        "--learning-rate", type=float, default=TrainConfig.learning_rate, help="at its peak"
+        "--epochs", type=command.whole(1, 100_000), default=TrainConfig.epochs, help="at most"
     )
     parser.add_argument(
-        "--patience", type=int, default=TrainConfig.patience, help="epochs without progress"
+        "--batch", type=command.whole(1, 65_536), default=TrainConfig.batch, help="queries a step"
+    )
+    parser.add_argument(
+        "--learning-rate",
+        type=command.real(1e-8, 1.0),
+        default=TrainConfig.learning_rate,
+        help="at its peak",
+    )
+    parser.add_argument(
+        "--patience",
+        type=command.whole(1, 100_000),
+        default=TrainConfig.patience,
+        help="epochs without progress",
     )
     parser.add_argument("--hard", action="store_true", help="labels 0 and 1, none between")
-    parser.add_argument("--seed", type=int, default=TrainConfig.seed, help="of weights and batches")
+    parser.add_argument(
+        "--seed", type=command.seed, default=TrainConfig.seed, help="of weights and batches"
+    )
 
 
 def _run_command(arguments: argparse.Namespace) -> int:

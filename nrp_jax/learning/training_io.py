@@ -50,7 +50,14 @@ class CheckpointStore:
             return state, best, []
         leaves = ocp.args.StandardRestore({"state": _plain(state), "best": best})
         arguments = ocp.args.Composite(arrays=leaves, history=ocp.args.JsonRestore())
-        saved = self._manager.restore(epoch, args=arguments)
+        try:
+            saved = self._manager.restore(epoch, args=arguments)
+        except Exception as error:  # of orbax and what it stands on, of many kinds
+            raise ValueError(
+                f"the checkpoint in '{self._manager.directory}' is not readable "
+                f"({type(error).__name__}); delete that folder to begin again, or choose another "
+                "with --out"
+            ) from error
         leaves = jax.tree.leaves(saved.arrays["state"])
         state = jax.tree.unflatten(jax.tree.structure(state), leaves)
         return state, saved.arrays["best"], saved.history

@@ -5,9 +5,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from nrp_jax.scene.field import DistanceField, clearance_bound
+from nrp_jax.scene.field import DistanceField
+from nrp_jax.scene.link_shapes import LinkShapes, gaps
+from nrp_jax.scene.near_cells import NearCells, touches
 from nrp_jax.scene.robots import PlanarBoxes
 from vrrt_jax.core.edges import StraightLineEdges, joint_steps
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import PytreeSubclasses, pytree, static
 from vrrt_jax.robots.kinematics import Chain, link_poses, place
 
@@ -16,7 +19,7 @@ from vrrt_jax.robots.kinematics import Chain, link_poses, place
 class RoundBase:
     """A round base among the cells that are low enough to be in its way."""
 
-    field: DistanceField  # planar
+    near: NearCells  # planar
     radius: jax.Array  # () [m]
     height: jax.Array  # () [m]
     link: int = static()
@@ -39,39 +42,49 @@ class GridWorld(PytreeSubclasses, StraightLineEdges):
     collision_spheres: jax.Array  # (L * 12, 3 n) their placement, see ``kinematics.placement``
     collision_radius: jax.Array  # (n,) [m]
     floor: jax.Array  # (n,) lowest height of their centers, -inf if they may touch the floor [m]
-    planar_boxes: PlanarBoxes | None  # flat links checked against each other, instead of spheres
-    # (m, n) distances at which the last m spheres touch the others, 0 for pairs not checked [m]
-    contact_distance: jax.Array
+    planar_boxes: PlanarBoxes | None  # flat links checked against each other
+    shapes: LinkShapes | None  # the same for links that are not flat
     base: RoundBase | None
-    field: DistanceField
+    near: tuple[NearCells, ...]  # for each group of spheres
+    field: DistanceField  # for networks
+    corner: jax.Array  # (2, 2) corner of the map in x and y: in float32, and what it lacks [m]
     lower: jax.Array  # (D,) [rad] or [m]
     upper: jax.Array  # (D,) [rad] or [m]
     is_continuous: jax.Array  # (D,) bool, joints that turn for ever
     arm_weight: jax.Array  # () meters that a radian of the arm counts for
     resolution: jax.Array  # () longest sub-step of any joint [m] or [rad]
+    groups: tuple[int, ...] = static()  # sizes of groups of spheres, as many as ``near``
 
+    @single_precision
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`nrp_jax.scene.world.is_free`."""
-        poses = link_poses(self.chain, q)
+        # The robot at the origin, and where it stands from the corner of the map: no digits are
+        # lost, wherever the map lies.
+        stand = (q[:2] - self.corner[0]) - self.corner[1]
+        poses = link_poses(self.chain, q.at[:2].set(0.0))
         # The barrier keeps XLA's CPU fusions from placing the spheres once for every use.
         centers = jax.lax.optimization_barrier(place(self.collision_spheres, poses))
-        # Self-collision: only the last m of n spheres have partners, see ``contact_distance``.
-        first = self.contact_distance.shape[1] - self.contact_distance.shape[0]
-        apart = sum((axis[first:, None] - axis) ** 2 for axis in centers)
-        free = jnp.all(apart >= self.contact_distance**2)
         # The home and its floor.
-        free &= jnp.all(clearance_bound(self.field, centers) > self.collision_radius)
-        free &= jnp.all(centers[2] > self.floor)
-        # Parts of the robot that are not spheres.
+        free = jnp.all(centers[2] > self.floor)
+        standing = centers.at[:2].add(stand[:, None])
+        first = 0
+        for near, size in zip(self.near, self.groups, strict=True):
+            group = slice(first, first + size)
+            free &= ~jnp.any(touches(near, standing[:, group], self.collision_radius[group]))
+            first += size
+        # The robot itself, and its parts that are not spheres.
         if self.planar_boxes is not None:
             free &= _boxes_apart(self.planar_boxes, poses)
+        if self.shapes is not None:
+            free &= jnp.all(jnp.concatenate(gaps(self.shapes, poses)) > 0)
         if self.base is not None:
+            free &= ~jnp.any(touches(self.base.near, stand[:, None], self.base.radius))
             free &= _base_is_free(self.base, poses, centers, self.collision_radius, self.floor)
         return free
 
     def interpolate(self, q_a: jax.Array, q_b: jax.Array, fraction: jax.Array) -> jax.Array:
         """Configurations (..., D) at a fraction (...) of the edges between others (..., D)."""
-        part = self.truncate(self.edge(q_a, q_b), jnp.asarray(fraction, q_a.dtype))
+        part = self.truncate(self.edge(q_a, q_b), jnp.asarray(fraction, jnp.asarray(q_a).dtype))
         return self.normalize(self.end(q_a, part))
 
     def distances(self, nodes: jax.Array, q: jax.Array, among: jax.Array) -> jax.Array:
@@ -136,12 +149,10 @@ def _boxes_apart(boxes: PlanarBoxes, poses: jax.Array) -> jax.Array:
 def _base_is_free(
     base: RoundBase, poses: jax.Array, centers: jax.Array, radius: jax.Array, floor: jax.Array
 ) -> jax.Array:
-    """Whether a cylinder touches neither a cell nor the spheres that must not touch the floor."""
+    """Whether a cylinder touches no sphere that must not touch the floor."""
     # Gap of each sphere's center to the cylinder, beside it and above it.
     position = poses[base.link, :3, 3:]
     beside = jnp.sqrt(jnp.sum((centers[:2] - position[:2]) ** 2, axis=0)) - base.radius
     above = centers[2] - base.height
     gap = jnp.maximum(beside, 0.0) ** 2 + jnp.maximum(above, 0.0) ** 2
-    return (clearance_bound(base.field, position)[0] > base.radius) & jnp.all(
-        (gap > radius**2) | jnp.isinf(floor)
-    )
+    return jnp.all((gap > radius**2) | jnp.isinf(floor))

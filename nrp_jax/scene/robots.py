@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from nrp_jax.scene.link_shapes import LinkShapes, link_shapes
 from nrp_jax.scene.mobile_mjcf import mobile_mjcf
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import pytree, static
 from vrrt_jax.robots.kinematics import (
     Chain,
@@ -16,14 +18,14 @@ from vrrt_jax.robots.kinematics import (
     link_poses,
     spheres_on_links,
 )
-from vrrt_jax.robots.mjcf import joint_ranges
+from vrrt_jax.robots.limits import joint_ranges
 from vrrt_jax.robots.self_collision import checked_pairs
 from vrrt_jax.robots.sphere_cover import cover_primitives
 
 FOOTPRINT = "footprint"  # geom of a round base that never tilts: a cylinder, not spheres
 _NAMES = ("snake", "fetch")  # files in scenes/mobile_robots
-# Half the side of the brick that one sphere covers [m], on the base and on the links.
-_GRAIN = {"snake": (0.02, 0.0125), "fetch": (0.05, 0.05)}
+# Half the side of the brick that one sphere covers [m], on the base (with the torso) and the links.
+_GRAIN = {"snake": (0.02, 0.0125), "fetch": (0.03, 0.05)}
 
 
 @pytree
@@ -57,13 +59,15 @@ class MobileRobot:
     upper: jax.Array  # (A,) [rad] or [m]
     is_continuous: jax.Array  # (D,) bool, joints that turn for ever
     collision_spheres: Spheres  # cover the robot but for its footprint: checked against obstacles
-    self_collision_pairs: jax.Array  # (P, 2) i32 indices of collision spheres to check
-    planar_boxes: PlanarBoxes | None  # checked against each other instead, if there are any
+    # What is checked against itself: flat boxes of a planar robot, or the shapes of another one.
+    planar_boxes: PlanarBoxes | None
+    shapes: LinkShapes | None
     footprint: Footprint | None  # of a round base
     feature_link: jax.Array  # (F,) i32, the link of each feature point
     feature_point: jax.Array  # (F, 3) in the link's frame [m]
     name: str = static()
     joint_names: tuple[str, ...] = static()  # (D,)
+    link_names: tuple[str, ...] = static()  # (L,)
     angular: tuple[bool, ...] = static()  # (D,) joints that turn; the others slide
     planar: bool = static()  # heights do not matter
     xml: str = static()  # MJCF of primitive geoms
@@ -79,6 +83,7 @@ class MobileRobot:
         return self.num_joints - self.lower.shape[0]
 
 
+@single_precision
 def link_features(robot: MobileRobot, q: jax.Array) -> jax.Array:
     """Points that describe the posture: tips of the snake's links, joint frames of the Fetch.
 
@@ -94,9 +99,10 @@ def link_features(robot: MobileRobot, q: jax.Array) -> jax.Array:
     return points * jnp.array([1.0, 1.0, 0.0]) if robot.planar else points
 
 
-batch_link_features = jax.jit(jax.vmap(link_features, (None, 0)))
+batch_link_features = single_precision(jax.jit(jax.vmap(link_features, (None, 0))))
 
 
+@single_precision
 @functools.cache
 def load_robot(name: str) -> MobileRobot:
     """Load "snake" (8 joints) or "fetch" (11 joints).
@@ -114,12 +120,10 @@ def load_robot(name: str) -> MobileRobot:
     base_dim = 2 if planar else 3
     # Spheres stand for all geoms but the footprint, which is checked as the cylinder that it is.
     is_footprint = np.array([model.geom(g).name == FOOTPRINT for g in range(model.ngeom)])
-    is_base = body_link[model.geom_bodyid] <= base_dim
+    is_base = body_link[model.geom_bodyid] <= base_dim + (not planar)  # with the torso
     covered = np.flatnonzero(~is_footprint)
     grain = np.where(is_base, *_GRAIN[name])[covered]
-    spheres, geom_of_sphere = cover_primitives(model, covered, grain, planar=planar)
-    # A planar robot is checked against itself as planar boxes, which are exact, not as spheres.
-    pairs = checked_pairs(model, geom_of_sphere[: 0 if planar else None])
+    spheres, _ = cover_primitives(model, covered, grain, planar=planar)
     lower, upper = joint_ranges(model)
     is_hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
     site_link, site_point = _points_on_links(
@@ -131,13 +135,17 @@ def load_robot(name: str) -> MobileRobot:
         upper=jnp.asarray(upper[base_dim:], jnp.float32),
         is_continuous=jnp.asarray((model.jnt_limited == 0) & is_hinge),
         collision_spheres=spheres_on_links(spheres, body_link, body_in_link),
-        self_collision_pairs=jnp.asarray(pairs),
         planar_boxes=_planar_boxes(model, body_link, body_in_link) if planar else None,
+        shapes=None if planar else link_shapes(model, covered, body_link, body_in_link),
         footprint=_footprint(model, body_link) if is_footprint.any() else None,
         feature_link=jnp.asarray(site_link, jnp.int32),
         feature_point=jnp.asarray(site_point, jnp.float32),
         name=name,
         joint_names=tuple(model.joint(j).name for j in range(model.njnt)),
+        link_names=tuple(
+            model.body(int(np.flatnonzero(body_link == link)[0])).name
+            for link in range(chain.num_links)
+        ),
         angular=tuple(is_hinge.tolist()),
         planar=planar,
         xml=xml,

@@ -12,9 +12,11 @@ import numpy as np
 
 from nrp_jax.homes.grid import Grid
 from nrp_jax.scene.car_world import CarWorld
-from nrp_jax.scene.field import DistanceField, make_field
+from nrp_jax.scene.field import make_field
 from nrp_jax.scene.grid_world import GridWorld, RoundBase
+from nrp_jax.scene.near_cells import make_near_cells
 from nrp_jax.scene.robots import MobileRobot
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots.kinematics import Chain, Spheres, placement
 
 ARM_WEIGHT = {"snake": 0.167, "fetch": 0.125}  # of the paper's metrics [m/rad]
@@ -22,6 +24,7 @@ RESOLUTION = {"snake": 0.1, "fetch": 0.2}  # sub-steps of the paper [m] and [rad
 TURNING_RADIUS = 0.1  # of the Fetch's base [m]
 
 
+@single_precision
 def is_free(world: GridWorld, q: jax.Array) -> jax.Array:
     """Whether ``q`` (D,) touches no solid cell, not the floor, nor the robot itself, () bool.
 
@@ -31,9 +34,11 @@ def is_free(world: GridWorld, q: jax.Array) -> jax.Array:
     return world.is_free(q)
 
 
-batch_is_free = jax.jit(jax.vmap(is_free, (None, 0)))  # of q (n, D), for the host
+# Of q (n, D), for the host.
+batch_is_free = single_precision(jax.jit(jax.vmap(is_free, (None, 0))))
 
 
+@single_precision
 def build_world(
     robot: MobileRobot,
     grid: Grid,
@@ -69,22 +74,30 @@ def build_world(
         if not value > 0:
             raise ValueError(f"{name} is {value}; expected a positive number, such as 0.1")
     grid = _fitting(robot.planar, grid)
+    # Spheres in groups: larger ones have to look at more cells around them.
+    radius = np.asarray(robot.collision_spheres.radius)
+    reach = np.ceil(radius / grid.resolution * (1 - 1e-6))
+    order = np.argsort(reach, kind="stable")
+    spheres = jax.tree.map(lambda a: np.asarray(a)[order], robot.collision_spheres)
     # Only the arm must stay above the floor: the base and the torso stand on it.
-    is_arm = np.asarray(robot.collision_spheres.link) > robot.base_dim + 1
-    floor = np.where(is_arm & (not robot.planar), robot.collision_spheres.radius, -np.inf)
+    is_arm = spheres.link > robot.base_dim + 1
+    floor = np.where(is_arm & (not robot.planar), spheres.radius, -np.inf)
     # The base may be anywhere on the map, with any heading.
     turn = [np.pi] * (robot.base_dim - 2)
     is_base = np.arange(robot.num_joints) < robot.base_dim
     corner = np.array(grid.origin[:2])
     fields = {
         "chain": robot.chain,
-        "collision_spheres": _placement(robot.collision_spheres, robot.chain),
-        "collision_radius": robot.collision_spheres.radius,
-        "floor": jnp.asarray(floor, jnp.float32),
+        "collision_spheres": _placement(spheres, robot.chain),
+        "collision_radius": _float(spheres.radius),
+        "floor": _float(floor),
         "planar_boxes": robot.planar_boxes,
-        "contact_distance": jnp.asarray(_contact_distance(robot)),
+        "shapes": robot.shapes,
         "base": _round_base(robot, grid),
+        "near": tuple(make_near_cells(grid, radius[reach == r].max()) for r in np.unique(reach)),
+        "groups": tuple(np.unique(reach, return_counts=True)[1].tolist()),
         "field": make_field(grid),
+        "corner": _split(corner),
         "lower": _float(np.concatenate([corner, np.negative(turn), robot.lower])),
         "upper": _float(np.concatenate([corner + grid.size[:2], turn, robot.upper])),
         "is_continuous": robot.is_continuous & (is_base | wrap),
@@ -96,6 +109,7 @@ def build_world(
     return CarWorld(**fields, radius=jnp.float32(turning_radius))
 
 
+@single_precision
 def with_grid(world: GridWorld, grid: Grid) -> GridWorld:
     """The same robot in another home; nothing re-compiles if the maps are of one size.
 
@@ -106,14 +120,40 @@ def with_grid(world: GridWorld, grid: Grid) -> GridWorld:
     corner = np.array(grid.origin[:2])
     base = world.base
     if base is not None:
-        base = dataclasses.replace(base, field=_low_field(grid, float(base.height)))
+        low = grid.flatten(0.0, float(base.height))
+        base = dataclasses.replace(base, near=make_near_cells(low, float(base.radius)))
+    # The largest radius of each group of spheres.
+    ends = np.cumsum(world.groups)
+    radius = [part.max() for part in np.split(np.asarray(world.collision_radius), ends[:-1])]
     return dataclasses.replace(
         world,
         base=base,
+        near=tuple(make_near_cells(grid, float(r)) for r in radius),
         field=make_field(grid),
+        corner=_split(corner),
         lower=world.lower.at[:2].set(corner),
         upper=world.upper.at[:2].set(corner + grid.size[:2]),
     )
+
+
+def from_corner(world: GridWorld) -> GridWorld:
+    """The same world with its map's corner at the origin.
+
+    Planners work in it: far from the origin float32 has no digits left for a robot.
+    """
+    size = (jnp.array(world.field.values.shape[:2]) - 1) * world.field.step
+    size = size - 2 * world.field.resolution  # the field has a rim of one cell
+    return dataclasses.replace(
+        world,
+        corner=jnp.zeros_like(world.corner),
+        lower=world.lower.at[:2].set(0.0),
+        upper=world.upper.at[:2].set(size),
+    )
+
+
+def corner_of(world: GridWorld) -> np.ndarray:
+    """The corner (2,) of a world's map, in float64 [m]."""
+    return np.asarray(world.corner, np.float64).sum(axis=0)
 
 
 def _fitting(planar: bool, grid: Grid) -> Grid:
@@ -127,32 +167,23 @@ def _fitting(planar: bool, grid: Grid) -> Grid:
     return grid
 
 
-def _contact_distance(robot: MobileRobot) -> np.ndarray:
-    """Sums of the radii (m, n) of checked pairs, of the last m spheres with any; else 0 [m]."""
-    radius = np.asarray(robot.collision_spheres.radius)
-    first, second = np.asarray(robot.self_collision_pairs).T
-    if not len(first):
-        return np.zeros((0, len(radius)), np.float32)
-    # The second sphere of a pair is the later one: rows before the first of these are all zero.
-    distance = np.zeros((len(radius),) * 2, np.float32)
-    distance[second, first] = radius[first] + radius[second]
-    return distance[second.min() :]
-
-
 def _round_base(robot: MobileRobot, grid: Grid) -> RoundBase | None:
     footprint = robot.footprint
     if footprint is None:
         return None
+    low = grid.flatten(0.0, float(footprint.height))
     return RoundBase(
-        field=_low_field(grid, float(footprint.height)),
+        near=make_near_cells(low, float(footprint.radius)),
         radius=footprint.radius,
         height=footprint.height,
         link=footprint.link,
     )
 
 
-def _low_field(grid: Grid, height: float) -> DistanceField:
-    return make_field(grid.flatten(0.0, height))
+def _split(corner: np.ndarray) -> jax.Array:
+    """A place (2,) as two of float32, (2, 2), which sum up to it."""
+    near = corner.astype(np.float32)
+    return jnp.asarray(np.stack([near, corner - near]), jnp.float32)
 
 
 def _placement(spheres: Spheres, chain: Chain) -> jax.Array:

@@ -77,7 +77,7 @@ def check(result, start=START, goal=GOAL):
     assert result.ok and result.verification.ok
     np.testing.assert_allclose(result.path[0], start, atol=1e-5)
     np.testing.assert_allclose(result.path[-1], goal, atol=1e-5)
-    assert result.verification.checked == len(result.trajectory)
+    assert result.verification.checked >= len(result.trajectory)
     assert result.raw_path.shape[1] == len(start)
 
 
@@ -207,7 +207,7 @@ def test_sideways_is_seen():
         ({"q_start": START[:5]}, r"the start has shape \(5,\); expected \(8,\): x, y"),
         ({"q_start": START + 50}, r"the start's x is 51.0; the map spans \[0.000, 5.000\]"),
         ({"q_goal": np.full(8, np.nan)}, "the goal's x is nan"),
-        ({"q_goal": np.r_[2.5, 1.0, START[2:]]}, "the goal touches the map"),
+        ({"q_goal": np.r_[2.5, 1.0, START[2:]]}, "the goal is not free: .* touches the map at"),
         ({"planner": "prm"}, "unknown planner 'prm'; have: rrt, rrt-is"),
         ({"method": "prm"}, "unknown planner 'prm'; have: rrt, rrt-is"),
         ({"planner": object()}, "the planner object lacks edge_steps, lanes, init"),

@@ -107,8 +107,8 @@ def test_bad_input_is_one_clear_line_and_writes_nothing(tmp_path, problem_copy, 
     expect("missing --world", "--robot", "panda")
     expect("not both", "--problem", folder, "--robot", "panda")
     expect("--problem or --self-model", "--problem", folder, "--self-model", "arm.npz")
-    expect("capacity=0", "--problem", folder, "--capacity", 0)
-    expect("time_limit_s=-1", "--problem", folder, "--time-limit", -1)
+    expect("--capacity: '0'; expected", "--problem", folder, "--capacity", 0)
+    expect("--time-limit: '-1'; expected", "--problem", folder, "--time-limit", -1)
     outside = [3.0, *fields["start"][1:]]
     expect("joint1' is at 3.0000, its bounds", "--problem", change(start=outside))
     expect("has shape (3,)", "--problem", change(start=fields["start"][:3]))

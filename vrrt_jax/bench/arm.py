@@ -13,6 +13,7 @@ from vrrt_jax.bench import arm_trials, ompl_peers
 from vrrt_jax.bench.arm_problems import ArmProblems, read_problems
 from vrrt_jax.bench.arm_trials import Refusal, Trial
 from vrrt_jax.bench.results_file import plain, resume, write
+from vrrt_jax.bench.runner import total_refused
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.timing import machine
 from vrrt_jax.report import versions
@@ -209,7 +210,8 @@ def summarize(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     Returns:
         ``solved``, ``failed``, and of all that were tried the times ``median_ms``, ``p95_ms``,
         ``search_median_ms`` and ``stages_ms``; ``cost`` is the median of what was solved,
-        ``raw_cost`` that before it was shortened. None where there is nothing to tell.
+        ``raw_cost`` that before it was shortened; ``refused_paths`` is how many paths the exact
+        check refused before. None where there is nothing to tell.
     """
     walls = [row["wall_ms"] for row in rows]
     names = rows[0]["stages_ms"] if rows else ()
@@ -225,6 +227,7 @@ def summarize(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "stages_ms": stages,
         "raw_cost": _median(row["raw_cost"] for row in rows),
         "cost": _median(row["cost"] for row in rows),
+        "refused_paths": total_refused(rows),
     }
 
 

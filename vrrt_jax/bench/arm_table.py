@@ -18,6 +18,7 @@ HEADS = (
     "raw cost [rad]",
     "cost [rad]",
     "batch [1/s]",
+    "refused by the exact check",
 )
 
 
@@ -38,6 +39,7 @@ def to_text(results: Mapping[str, Any]) -> str:
                     *(_number(stages.get(name)) for name in ("search", "shortcut", "verify")),
                     *(_number(summary[name], 2) for name in ("raw_cost", "cost")),
                     _number(summary.get("batch_problems_per_s")),
+                    _number(summary.get("refused_paths"), 0),
                 ]
             )
         notes.append(_note(scene, found))

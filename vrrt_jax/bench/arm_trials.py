@@ -157,7 +157,8 @@ def solve(
 
     Returns:
         A row: ``index``, ``status``, ``solved``, ``wall_ms`` of the whole call, ``stages_ms``,
-        ``cost`` [rad], ``raw_cost`` before shortening, ``held_attached`` and ``recompiled``.
+        ``cost`` [rad], ``raw_cost`` before shortening, ``refused_paths`` by the exact check,
+        ``held_attached`` and ``recompiled``.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed meanwhile.
@@ -192,6 +193,7 @@ def solve(
         },
         "raw_cost": path_length(trial.world, result.raw_path) if result.ok else None,
         "cost": result.cost if result.ok else None,
+        "refused_paths": result.refused,
         "held_attached": trial.held_attached,
         "recompiled": recompiled,
     }

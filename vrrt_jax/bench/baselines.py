@@ -58,6 +58,7 @@ class BaselineResult:
     match_threshold: float  # at or below which the image is matched
     found_path: bool  # False if there was an estimate of the goal, but no way to it
     search_s: float  # without compilation
+    refused: int = 0  # paths that the exact check refused
 
 
 @pytree
@@ -256,4 +257,5 @@ def rrt_star_to_estimate(
         match_threshold=estimate.match_threshold,
         found_path=reached,
         search_s=estimate.search_s + found.timing["search_s"] + found.timing["shortcut_s"],
+        refused=found.refused,
     )

@@ -23,7 +23,12 @@ def add_bench(kinds: Any) -> None:
             _add_engine(speed)
     twins = kinds.add_parser("twins", help="how alike a robot looks after half a turn of its wrist")
     twins.set_defaults(run=_twins)
-    twins.add_argument("--tasks-per-level", type=int, default=20, help="tasks at each distance")
+    twins.add_argument(
+        "--tasks-per-level",
+        type=command.whole(1, 100_000),
+        default=20,
+        help="tasks at each distance",
+    )
     twins.add_argument("--json", help="write the figures here")
     twins.add_argument("--figure", help="draw a goal of each robot and its twin into this .png")
     for what, words in (
@@ -50,8 +55,13 @@ def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument("--robot", required=True, help="panda, ur5e or fetch")
     levels = "0.5,1.0,1.5,2.0,2.5"
     parser.add_argument("--levels", type=command.numbers, default=levels, help="distances [rad]")
-    parser.add_argument("--tasks-per-level", type=int, default=20, help="tasks at each distance")
-    parser.add_argument("--seed", type=int, default=0, help="of tasks and plans")
+    parser.add_argument(
+        "--tasks-per-level",
+        type=command.whole(1, 100_000),
+        default=20,
+        help="tasks at each distance",
+    )
+    parser.add_argument("--seed", type=command.seed, default=0, help="of tasks and plans")
     if what == "ablation":
         parser.add_argument("--only", help="one setting, such as eta; all by default")
         parser.add_argument("--config", default="paper", help="whose settings: paper or default")
@@ -60,13 +70,21 @@ def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
             "--method", default="vrrt", help="vrrt, dr-robot, dr-robot-rrt-star or prof-robot"
         )
         parser.add_argument("--config", default="default", help="default or paper")
-    parser.add_argument("--views", type=int, default=1, choices=(1, 2), help="cameras")
-    parser.add_argument("--azimuth", type=float, default=0.0, help="turn the cameras [degree]")
-    parser.add_argument("--light", type=float, default=1.0, help="brightness of the lamp")
+    parser.add_argument(
+        "--views", type=command.whole(1, 2), default=1, choices=(1, 2), help="cameras"
+    )
+    parser.add_argument(
+        "--azimuth", type=command.real(-360.0, 360.0), default=0.0, help="turn the cameras [degree]"
+    )
+    parser.add_argument(
+        "--light", type=command.real(0.01, 100.0), default=1.0, help="brightness of the lamp"
+    )
     parser.add_argument("--occluded", action="store_true", help="obstacles hide the robot")
     _add_engine(parser)
-    parser.add_argument("--time-limit", type=float, default=60.0, help="of one search [s]")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument(
+        "--time-limit", type=command.seconds, default=60.0, help="of one search [s]"
+    )
+    parser.add_argument("--jobs", type=command.whole(1, 1024), default=1, help="processes")
     parser.add_argument("--json", help="write results here; go on from what it holds")
 
 
@@ -82,17 +100,30 @@ def _add_arm(parser: argparse.ArgumentParser) -> None:
     add_robot(parser)
     parser.add_argument(
         "--base",
-        type=command.numbers,
+        type=_base,
         help="where the robot's base link stands in the files, as --base=x,y,z,yaw [m, rad]",
     )
     parser.add_argument("--planner", default="rrt-connect", help="rrt-connect, rrt or rrt-star")
     _add_engine(parser)
-    parser.add_argument("--limit", type=int, help="problems of each file, evenly taken")
-    parser.add_argument("--batch", type=int, help="measure the rate of batches of so many too")
+    parser.add_argument(
+        "--limit", type=command.whole(1, 1_000_000), help="problems of each file, evenly taken"
+    )
+    parser.add_argument(
+        "--batch", type=command.whole(1, 100_000), help="measure the rate of batches of so many too"
+    )
     parser.add_argument("--peers", action="store_true", help="OMPL's planners too")
-    parser.add_argument("--seed", type=int, default=0, help="of all plans")
-    parser.add_argument("--time-limit", type=float, default=60.0, help="of one search [s]")
+    parser.add_argument("--seed", type=command.seed, default=0, help="of all plans")
+    parser.add_argument(
+        "--time-limit", type=command.seconds, default=60.0, help="of one search [s]"
+    )
     parser.add_argument("--json", help="write results here; go on from what it holds")
+
+
+def _base(text: str) -> Any:
+    values = command.numbers(text)
+    if len(values) != 4:
+        raise argparse.ArgumentTypeError(f"'{text}' has {len(values)} numbers; expected x,y,z,yaw")
+    return values
 
 
 def _speed(arguments: argparse.Namespace) -> int:
@@ -123,8 +154,6 @@ def _protocol(arguments: argparse.Namespace) -> int:
     from vrrt_jax.bench import protocol, runner, tables
     from vrrt_jax.bench.tasks import Scenery
 
-    if arguments.jobs < 1:
-        raise ValueError(f"--jobs is {arguments.jobs}; expected at least 1")
     choices = ("method", "config", "only", "engine")
     chosen = {name: getattr(arguments, name) for name in choices if hasattr(arguments, name)}
     benchmark = protocol.benchmark(
@@ -166,7 +195,14 @@ def _arm(arguments: argparse.Namespace) -> int:
 
 
 def _joint_values(text: str) -> dict[str, float]:
+    pairs = [part.split("=") for part in text.split(",")]
     try:
-        return {k: float(v) for k, v in (part.split("=") for part in text.split(","))}
+        values = {name: float(value) for name, value in pairs}
     except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a list such as finger=0.04") from None
+        values = {"": 0.0}
+    known = all(name.strip() and abs(value) <= command.LARGEST for name, value in values.items())
+    if not known or len(values) < len(pairs):
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is not a list such as finger=0.04, each joint once"
+        )
+    return values

@@ -11,6 +11,7 @@ import numpy as np
 
 from vrrt_jax import planner
 from vrrt_jax.bench import baselines
+from vrrt_jax.bench.pose_ambiguity import looks_the_same
 from vrrt_jax.bench.tasks import (
     Scenery,
     Task,
@@ -61,10 +62,11 @@ class Attempt:
 
     path: np.ndarray  # (P, D)
     matched: bool  # the image of its end is below the match threshold
-    has_path: bool  # False if a goal was found, but no way to it
+    has_path: bool  # False if no way to its end was found
     out_of_time: bool
     loss: float
     search_s: float  # planning, without compilation
+    refused: int = 0  # paths that the exact check refused while planning
 
 
 def solve(
@@ -115,14 +117,15 @@ def solve(
     right = bool(error.mean() < SUCCESS_RAD)
     valid = not collisions or verify_path(robot, obstacle_list(world), attempt.path).ok
     success = right and valid and (attempt.has_path or not collisions)
-    psnr_db = image_psnr(robot_name, attempt.path[-1], images, scenery)
+    psnr_db = image_psnr(robot_name, attempt.path[-1], images, scenery, masks)
     length = path_length(world, attempt.path)
     reference, cause = None, ""
     if collisions and right and (valid or not attempt.has_path):
         reference = _reference_length(robot, world, task, key)
     if not success:
-        # The meshes look more alike in the two poses than the self-model is like the meshes.
-        alike = psnr_db >= self_model.level_for(config.polish.px).psnr_db
+        alike = not right and looks_the_same(
+            robot_name, task, attempt.path[-1], self_model, scenery, config.polish.px
+        )
         known = reference is not None or not collisions
         cause = _cause(attempt, right=right, valid=valid, alike=alike, known=known)
     return {
@@ -139,6 +142,8 @@ def solve(
         "path_over_reference": round(length / reference, 4) if success and reference else None,
         "loss": float(f"{attempt.loss:.4g}"),
         "psnr_db": round(psnr_db, 2),
+        # A path that is judged only here counts too.
+        "refused_paths": max(attempt.refused, int(not valid)),
         "time_s": round(attempt.search_s, 3),
         "wall_s": round(wall_s, 2),
     }
@@ -164,14 +169,15 @@ def _cause(attempt: Attempt, *, right: bool, valid: bool, alike: bool, known: bo
 
 def _plan(inputs, key, config: PlannerConfig, masks, guess) -> Attempt:
     result = planner.plan(*inputs, key=key, config=config, mask=masks, q_guess=guess)
-    times = result.timing
+    times, has_path = result.timing, result.verification is not None
     return Attempt(
-        path=result.path if result.status is not Status.NO_PATH else result.target[None],
+        path=result.path if has_path else result.target[None],
         matched=result.loss <= result.match_threshold,
-        has_path=result.status is not Status.NO_PATH,
+        has_path=has_path,
         out_of_time=result.status is Status.TIME_LIMIT,
         loss=result.loss,
         search_s=times["search_s"] + times["shortcut_s"] + times["verify_s"],
+        refused=result.refused,
     )
 
 
@@ -189,4 +195,5 @@ def _baseline(inputs, robot_name: str, task: Task, method: str, key, masks) -> A
         out_of_time=False,
         loss=found.loss,
         search_s=found.search_s,
+        refused=found.refused,
     )

@@ -88,6 +88,7 @@ def solve(robot: Robot, trial: Trial, *, name: str, seed: int) -> dict[str, Any]
         "status": status,
         "solved": verified,
         "found": found,
+        "refused_paths": int(found and not verified),
         "wall_ms": 1e3 * sum(stages.values()),
         "stages_ms": {stage: 1e3 * seconds for stage, seconds in stages.items()},
         "raw_cost": raw_cost if verified else None,

@@ -7,6 +7,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.bench.tasks import (
@@ -15,11 +17,19 @@ from vrrt_jax.bench.tasks import (
     Task,
     bench_robot,
     bench_world,
+    cameras,
     goal_images,
     image_psnr,
     make_task,
+    robot_views,
 )
 from vrrt_jax.core.edges import joint_error
+from vrrt_jax.robots.kinematics import Chain
+from vrrt_jax.splat.images import shrink_views
+from vrrt_jax.splat.loss import goal_loss, image_loss
+from vrrt_jax.splat.model import SelfModel
+from vrrt_jax.splat.types import GoalImage
+from vrrt_jax.visual.goal import ImageGoal, ImageObjective
 
 LEVELS = (0.5, 1.0, 1.5, 2.0, 2.5)  # distances from start to goal [rad]
 NUM_COMPARED = 5  # tasks of a level whose images are compared
@@ -84,6 +94,43 @@ def _is_nearer(robot_name: str, task: Task) -> bool:
         np.linalg.norm(joint_error(world, end, task.q_start)) for end in (q, task.q_goal)
     )
     return bool(to_twin < to_goal)
+
+
+def looks_the_same(
+    robot: str, task: Task, q: np.ndarray, self_model: SelfModel, scenery: Scenery, image_px: int
+) -> bool:
+    """Whether the goal image can hardly tell a configuration from the true one.
+
+    It cannot where the true meshes at ``q`` differ less from it than the self-model does at the
+    goal. Both differences are the planner's image loss, on one image with one mask.
+
+    Args:
+        robot: one of the benchmark's.
+        task: whose goal image it is.
+        q: (D,) the configuration that was found.
+        self_model: the robot's.
+        scenery: of the goal images.
+        image_px: height that the images are shrunk to [px].
+    """
+    images, masks = goal_images(robot, task, scenery)
+    goal = ImageGoal(self_model, cameras(robot, scenery), images, masks)
+    objective = goal.at(bench_robot(robot), image_px)
+    found, _ = shrink_views(robot_views(robot, q, scenery, masks), image_px)
+    at_found, at_truth = _losses(
+        bench_world(robot, task.world).chain, objective, found, jnp.asarray(task.q_goal)
+    )
+    return bool(at_found <= at_truth)
+
+
+@jax.jit
+def _losses(
+    chain: Chain, objective: ImageObjective, found: GoalImage, q_true: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Image losses () of found images (V, h, w, ...), and of the self-model at the goal (D,)."""
+    goal, splats = objective.image, objective.splats
+    losses = jax.vmap(image_loss)(found.rgb, found.alpha, goal.rgb, goal.alpha, goal.valid)
+    at_truth = goal_loss(chain, splats, objective.cameras, goal, q_true, objective.windows)
+    return jnp.mean(losses), at_truth
 
 
 def draw(path: str | Path, level: float = 2.5, seed: int = 0) -> None:

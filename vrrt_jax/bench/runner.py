@@ -4,7 +4,7 @@ import concurrent.futures
 import dataclasses
 import multiprocessing
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from vrrt_jax.core.timing import machine
 from vrrt_jax.problems import self_model_path
 from vrrt_jax.report import versions
 
-FORMAT = 2
+FORMAT = 3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -188,6 +188,7 @@ def summarize(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
                 ),
                 "mean_error_rad": _mean(row["mean_error_rad"] for row in own),
                 "median_psnr_db": _median(row["psnr_db"] for row in own),
+                "refused_paths": total_refused(own),
                 "straight_is_blocked": _mean(row["straight_is_blocked"] for row in own),
                 "causes": {
                     cause: count
@@ -197,6 +198,12 @@ def summarize(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
             }
         )
     return {"average_success": _mean(level["success"] for level in levels), "levels": levels}
+
+
+def total_refused(rows: Sequence[Mapping[str, Any]]) -> int | None:
+    """Paths that the exact check refused; None where an older file did not count them."""
+    counts = [row["refused_paths"] for row in rows if "refused_paths" in row]
+    return sum(counts) if len(counts) == len(rows) else None
 
 
 def _mean(values) -> float | None:

@@ -44,12 +44,13 @@ def to_text(results: dict[str, Any]) -> str:
                     else "",
                     f"{level['mean_error_rad']:.3f}",
                     f"{level['median_psnr_db']:.1f}",
+                    "" if level.get("refused_paths") is None else str(level["refused_paths"]),
                     causes,
                 ]
             )
         if len(summary["levels"]) > 1:
             average = _percent(summary["average_success"])
-            rows.append([name, "average", "", average, *[""] * 7])
+            rows.append([name, "average", "", average, *[""] * 8])
     heads = (
         "method",
         "level [rad]",
@@ -61,6 +62,7 @@ def to_text(results: dict[str, Any]) -> str:
         "of RRT-Connect's to the true goal",
         "mean error [rad]",
         "PSNR [dB]",
+        "paths refused by the exact check",
         "causes of failure",
     )
     return table(heads, rows)

@@ -17,7 +17,8 @@ from vrrt_jax.scene.obstacles import Obstacle
 from vrrt_jax.scene.verify import contacts, verify_path
 from vrrt_jax.scene.world import World, batch_is_free, build_world, obstacle_list
 from vrrt_jax.splat.camera import orbit
-from vrrt_jax.splat.mujoco_images import MeshRenderer
+from vrrt_jax.splat.images import View
+from vrrt_jax.splat.mujoco_images import MeshRenderer, Picture
 from vrrt_jax.splat.types import Camera
 
 ROBOTS = ("panda", "ur5e", "fetch")
@@ -180,13 +181,48 @@ def _renderer(robot_name: str, hiding: tuple[Obstacle, ...], light: float) -> Me
     return MeshRenderer(spec, hiding, light=light)
 
 
-def image_psnr(robot_name: str, q: np.ndarray, images: list[np.ndarray], scenery: Scenery) -> float:
-    """PSNR of the true meshes at ``q`` against the goal images, over white [dB]."""
-    renderer = _renderer(robot_name, (), scenery.light)
+def image_psnr(
+    robot_name: str,
+    q: np.ndarray,
+    images: list[np.ndarray],
+    scenery: Scenery,
+    masks: list[np.ndarray] | None = None,
+) -> float:
+    """PSNR of the true meshes at ``q`` against the goal images, over white, where masks are true.
+
+    Arguments but ``q`` (D,) are those, and what came of them, of :func:`goal_images`.
+
+    Returns:
+        The PSNR over all views [dB].
+    """
     errors = []
-    for camera, image in zip(cameras(robot_name, scenery), images, strict=True):
-        picture = renderer.picture(q, camera)
+    pictures = _pictures(robot_name, q, scenery)
+    for view, (picture, image) in enumerate(zip(pictures, images, strict=True)):
         over_white = picture.rgb + 1.0 - picture.alpha[..., None]
         goal = image[..., :3] * image[..., 3:] + 1.0 - image[..., 3:]
-        errors.append(np.mean((over_white - goal) ** 2))
+        error = (over_white - goal) ** 2
+        errors.append(np.mean(error if masks is None else error[masks[view]]))
     return float(-10.0 * np.log10(max(np.mean(errors), 1e-10)))
+
+
+def robot_views(
+    robot_name: str, q: np.ndarray, scenery: Scenery, masks: list[np.ndarray] | None = None
+) -> list[View]:
+    """The true meshes at ``q`` (D,) in each view, with nothing before them, where masks say so."""
+    views = []
+    for index, picture in enumerate(_pictures(robot_name, q, scenery)):
+        valid = np.ones_like(picture.alpha) if masks is None else masks[index].astype(np.float32)
+        views.append(
+            View(
+                rgb=picture.rgb * valid[..., None],
+                alpha=picture.alpha * valid,
+                valid=valid,
+                camera=cameras(robot_name, scenery)[index],
+            )
+        )
+    return views
+
+
+def _pictures(robot_name: str, q: np.ndarray, scenery: Scenery) -> list[Picture]:
+    renderer = _renderer(robot_name, (), scenery.light)
+    return [renderer.picture(q, camera) for camera in cameras(robot_name, scenery)]

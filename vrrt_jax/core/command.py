@@ -1,24 +1,55 @@
 """What the command lines share: exit codes, one-line errors, compiled programs, workers."""
 
 import argparse
+import contextlib
+import errno
+import math
 import multiprocessing
 import os
 import sys
+import tempfile
 import threading
-from collections.abc import Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 EXIT_SOLVED, EXIT_UNSOLVED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
+LARGEST = 1e9  # of numbers in lists
+_LONGEST = 600  # characters of a message
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+# Those whose messages are for users. Others are named, with what to do.
+KNOWN_ERRORS = (ValueError, OSError, RuntimeError, ModuleNotFoundError)
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser, also of sub-commands, whose help tells the defaults that are set."""
+    """A parser, also of sub-commands, whose help tells the defaults that are set.
+
+    What is wrong with an argument is told in one line. Texts must not be empty.
+    """
 
     def __init__(self, *args: Any, **settings: Any):
         """See :class:`argparse.ArgumentParser`."""
         settings.setdefault("formatter_class", _Defaults)
         super().__init__(*args, **settings)
+
+    def add_argument(self, *names: str, **settings: Any) -> argparse.Action:
+        """See :class:`argparse.ArgumentParser`; an argument without a type is :func:`words`."""
+        if names and "action" not in settings:
+            settings.setdefault("type", words)
+        return super().add_argument(*names, **settings)
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """See :class:`argparse.ArgumentParser`, which takes ``--seed=--`` for no value at all."""
+        found = super().parse_args(args, namespace)
+        for name, value in vars(found).items():
+            if isinstance(value, list) and not value:
+                self.error(f"argument --{name.replace('_', '-')}: expected a value")
+        return found
+
+    def error(self, message: str) -> NoReturn:
+        """End with the exit code 2 and one line."""
+        self.exit(EXIT_BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
 class _Defaults(argparse.ArgumentDefaultsHelpFormatter):
@@ -28,21 +59,153 @@ class _Defaults(argparse.ArgumentDefaultsHelpFormatter):
 
 
 def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> int:
-    """Run what the chosen sub-command has set as ``run``; bad input becomes one line.
+    """Run what the chosen sub-command has set as ``run``; what goes wrong becomes one line.
+
+    ``VRRT_TRACEBACK=1`` shows where it happened too.
 
     Returns:
         The exit code: 0 solved or done, 1 not solved, 2 bad input, 130 interrupted.
     """
-    arguments = parser.parse_args(argv)
-    _use_compilation_cache(parser.prog)
     try:
+        arguments = parser.parse_args(argv)
+    except SystemExit as ended:  # of --help, or of an option that makes no sense
+        return int(ended.code or 0)
+    name = f"{parser.prog} {arguments.command}"
+    try:
+        _check_outputs(arguments)
+        _set_up_jax(parser.prog)
         return arguments.run(arguments)
-    except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
-        print(f"{parser.prog} {arguments.command}: {error}", file=sys.stderr)
+    except Exception as error:
+        print(f"{name}: {in_one_line(error)}", file=sys.stderr)
+        if os.environ.get("VRRT_TRACEBACK"):
+            traceback.print_exc()
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        print(f"{parser.prog} {arguments.command}: interrupted", file=sys.stderr)
+        print(f"{name}: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
+
+
+def in_one_line(error: Exception) -> str:
+    """What went wrong, where, and what to do."""
+    text = " ".join(str(error).split())
+    if len(text) > _LONGEST:
+        text = f"{text[:_LONGEST]} ..."
+    if isinstance(error, MemoryError):
+        return (
+            f"out of memory ({text or 'no more is to be had'}); close other programs, or ask for "
+            "less: smaller files, fewer nodes, images or processes"
+        )
+    if isinstance(error, OSError) and error.errno in _NO_ROOM:
+        return f"{text}; make room on that disk, or choose another place"
+    if isinstance(error, OSError) and error.errno is not None:
+        return f"{text}; check that path and its permissions"
+    if isinstance(error, KNOWN_ERRORS):
+        return text or type(error).__name__
+    kind = type(error)
+    return (
+        f"{kind.__module__}.{kind.__qualname__}: {text or 'no message'}; check the files that were "
+        "given, or see where it happened with VRRT_TRACEBACK=1"
+    )
+
+
+def _check_outputs(arguments: argparse.Namespace) -> None:
+    """Check, before any work, that what a command writes can be written.
+
+    ``--json`` and ``--figure`` name files. ``--out`` does where the parser says ``out_is_file``.
+
+    Raises:
+        OSError: names the place that cannot be written.
+    """
+    files = ["json", "figure"] + ["out"] * getattr(arguments, "out_is_file", False)
+    for name in ("out", "json", "figure"):
+        place, option = getattr(arguments, name, None), f"--{name}"
+        if place is None:
+            continue
+        if name not in files:
+            writable_folder(place, option)
+            continue
+        file = Path(place)
+        writable_folder(file.parent, option)
+        if file.is_dir():
+            raise OSError(f"'{file}' is a folder; expected a file with {option}")
+        if file.exists() and not os.access(file, os.W_OK):
+            raise OSError(f"cannot write '{file}': it is read-only; choose another with {option}")
+
+
+@contextlib.contextmanager
+def or_printed(text: Callable[[], str]) -> Iterator[None]:
+    """If what the block writes cannot be written, its text is printed before the error is told."""
+    try:
+        yield
+    except OSError:
+        print(text(), flush=True)
+        raise
+
+
+def writable_folder(folder: str | Path, option: str = "--out") -> Path:
+    """The folder, made if need be; an error before any work if it cannot be written to.
+
+    Raises:
+        OSError: names the folder, and the option to choose another with.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"0" * 4096)
+            file.flush()
+    except OSError as error:
+        raise OSError(
+            f"cannot write to the folder '{folder}': {error.strerror}; choose another with {option}"
+        ) from None
+    return folder
+
+
+def words(text: str) -> str:
+    """An argument that is not empty."""
+    if not text.strip() or "\0" in text:
+        raise argparse.ArgumentTypeError("the text is empty; expected a word or a path")
+    return text
+
+
+def whole(low: int, high: int) -> Callable[[str], int]:
+    """The type of an argument that is a whole number between two others."""
+
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = None
+        if value is None or not low <= value <= high:
+            raise argparse.ArgumentTypeError(
+                f"'{_short(text)}'; expected a whole number from {low} to {high}"
+            )
+        return value
+
+    return parse
+
+
+seed = whole(0, 2**31 - 1)
+
+
+def real(low: float, high: float) -> Callable[[str], float]:
+    """The type of an argument that is a number between two others."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(
+                f"'{_short(text)}'; expected a number from {low:g} to {high:g}"
+            )
+        return value
+
+    return parse
+
+
+seconds = real(0.0, 1e9)
 
 
 def numbers(text: str) -> Any:
@@ -50,9 +213,18 @@ def numbers(text: str) -> Any:
     import numpy as np
 
     try:
-        return np.array([float(part) for part in text.split(",")], np.float32)
+        values = [float(part) for part in text.split(",")]
     except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a list such as 0,0.3,-1.2") from None
+        values = [math.nan]
+    if not all(abs(value) <= LARGEST for value in values):
+        raise argparse.ArgumentTypeError(
+            f"'{_short(text)}' is not a list of numbers such as 0,0.3,-1.2"
+        )
+    return np.array(values, np.float32)
+
+
+def _short(text: str) -> str:
+    return text if len(text) < 60 else f"{text[:60]}..."
 
 
 def usable_cores() -> int:
@@ -73,12 +245,17 @@ def end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _use_compilation_cache(name: str) -> None:
-    """Keep compiled programs between runs, unless the user has said where or not at all."""
+def _set_up_jax(name: str) -> None:
+    """Single precision; and compiled programs that are kept between runs.
+
+    The user may have said where they are kept, or that they are not.
+    """
+    import jax
+
+    os.environ["JAX_ENABLE_X64"] = "0"  # also of worker processes
+    jax.config.update("jax_enable_x64", False)
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    import jax
-
     jax.config.update("jax_compilation_cache_dir", str(home / f"{name}_jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)

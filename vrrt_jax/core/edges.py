@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import pytree
 
 Edge = Any
@@ -172,9 +173,16 @@ def short_way(step: jax.Array, is_continuous: jax.Array) -> jax.Array:
     return step - 2 * jnp.pi * turns
 
 
+@single_precision
 def difference(world: StraightLineEdges, q_from: jax.Array, q_to: jax.Array) -> jax.Array:
     """The step (..., D) from one configuration to another, the short way round."""
     return short_way(q_to - q_from, world.is_continuous)
+
+
+def steps_between(world: StraightLineEdges, q_from: np.ndarray, q_to: np.ndarray) -> np.ndarray:
+    """Steps (..., D) from configurations to others, the short way round; on the host."""
+    step = q_to - q_from
+    return step - 2 * np.pi * np.round(step / (2 * np.pi)) * np.asarray(world.is_continuous)
 
 
 def joint_error(world: StraightLineEdges, q: np.ndarray, q_goal: np.ndarray) -> np.ndarray:
@@ -183,12 +191,16 @@ def joint_error(world: StraightLineEdges, q: np.ndarray, q_goal: np.ndarray) -> 
 
 
 def unwrapped(world: StraightLineEdges, path: np.ndarray) -> np.ndarray:
-    """The path (P, D) with joints that wrap going on, so that a controller may interpolate."""
+    """The path (P, D) from where it starts, with joints that wrap going on from there.
+
+    A controller may interpolate it, also beyond a turn.
+    """
     path, is_continuous = np.array(path), np.asarray(world.is_continuous)
     path[:, is_continuous] = np.unwrap(path[:, is_continuous], axis=0)
     return path
 
 
+@single_precision
 def distance(world: Space, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
     """Length (...) of the edge between configurations (..., D)."""
     return world.distance(q_a, q_b)
@@ -198,6 +210,12 @@ def normalize(world: StraightLineEdges, q: jax.Array) -> jax.Array:
     """Bring wrapping joints of (..., D) back to [-pi, pi)."""
     turns = jnp.where(world.is_continuous, jnp.floor((q + jnp.pi) / (2 * jnp.pi)), 0.0)
     return q - 2 * jnp.pi * turns
+
+
+def nearest_turn(world: StraightLineEdges, q: np.ndarray, q_near: np.ndarray) -> np.ndarray:
+    """The same configurations (..., D), whole turns nearer to others (..., D); on the host."""
+    turns = np.round((np.asarray(q_near, float) - q) / (2 * np.pi))
+    return np.asarray(q + 2 * np.pi * turns * np.asarray(world.is_continuous), np.float32)
 
 
 def enforce_bounds(world: StraightLineEdges, q: jax.Array) -> jax.Array:

@@ -28,6 +28,12 @@ class ConfigurationGoal:
         return difference(world, self.q, q)
 
 
+def starts_at(goal: ConfigurationGoal, world: Any, q_start: Any) -> bool:
+    """Whether a plan that starts at ``q_start`` (D,) is at its goal; on the host."""
+    far = float(world.distance(jnp.asarray(q_start), jnp.asarray(goal.q)))
+    return far <= min(float(goal.threshold), REACHED)
+
+
 class LeastSquaresGoal(PytreeSubclasses):
     """Base of goals whose loss is a sum of squares: ``loss = sum(residual ** 2)``.
 

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 
 from vrrt_jax.core.command import usable_cores
+from vrrt_jax.core.precision import single_precision
 
 
 def map_on_threads(function: Callable, items: Iterable[Any]) -> list[Any]:
@@ -16,4 +17,4 @@ def map_on_threads(function: Callable, items: Iterable[Any]) -> list[Any]:
     wait for their own results keep all cores busy.
     """
     with ThreadPoolExecutor(usable_cores()) as pool:
-        return list(pool.map(lambda item: jax.device_get(function(item)), items))
+        return list(pool.map(single_precision(lambda item: jax.device_get(function(item))), items))

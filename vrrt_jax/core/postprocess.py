@@ -7,10 +7,10 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from vrrt_jax.core.edges import Space
+from vrrt_jax.core.edges import Space, StraightLineEdges
 from vrrt_jax.core.result import PlanResult, Status, Verification, rejected_lanes
 from vrrt_jax.core.search import SearchResult
-from vrrt_jax.core.shortcut import path_length, shortcut
+from vrrt_jax.core.shortcut import path_length, shortcut, without_repeats
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -31,6 +31,7 @@ class Postprocessed:
     compile_s: float = 0.0
     shortcut_s: float = 0.0
     verify_s: float = 0.0
+    refused: int = 0  # paths that the exact check refused
 
     @property
     def is_verified(self) -> bool:
@@ -46,7 +47,7 @@ def unchecked(path: np.ndarray, trajectory: np.ndarray | None = None) -> Postpro
 
 
 def postprocess(
-    world: Space,
+    world: StraightLineEdges,
     raw_path: np.ndarray,
     check: Callable[[np.ndarray], CheckedPath],
     *,
@@ -55,6 +56,8 @@ def postprocess(
 ) -> Postprocessed:
     """Shorten a path and verify it; if the short path is refused, the raw one may still be right.
 
+    No waypoint of what comes out repeats the one before.
+
     Args:
         world: robot and obstacles.
         raw_path: (P, D) waypoints as the tree has them.
@@ -62,15 +65,16 @@ def postprocess(
         key: random key.
         rounds: of shortcutting.
     """
+    raw_path = without_repeats(world, raw_path)
     begun_s = time.perf_counter()
     shortcut(world, raw_path, key=key, rounds=0)  # compiles, if anything has to
     compiled_s = time.perf_counter()
-    short_path = shortcut(world, raw_path, key=key, rounds=rounds)
+    short_path = without_repeats(world, shortcut(world, raw_path, key=key, rounds=rounds))
     shortened_s = time.perf_counter()
-    checked = check(short_path)
-    if checked.verification is not None and not checked.verification.ok:
-        raw = check(raw_path)
-        checked = raw if raw.verification is not None and raw.verification.ok else checked
+    verdicts = [check(short_path)]
+    if _is_refused(verdicts[0]) and not np.array_equal(short_path, raw_path):
+        verdicts.append(check(raw_path))
+    checked = next((verdict for verdict in verdicts if not _is_refused(verdict)), verdicts[0])
     verified_s = time.perf_counter()
     return Postprocessed(
         raw_path=raw_path,
@@ -78,7 +82,12 @@ def postprocess(
         compile_s=compiled_s - begun_s,
         shortcut_s=shortened_s - compiled_s,
         verify_s=verified_s - shortened_s,
+        refused=sum(map(_is_refused, verdicts)),
     )
+
+
+def _is_refused(checked: CheckedPath) -> bool:
+    return checked.verification is not None and not checked.verification.ok
 
 
 def plan_result(
@@ -129,4 +138,5 @@ def plan_result(
         },
         history=found.history,
         tree=found.tree,
+        refused=done.refused,
     )

@@ -52,10 +52,11 @@ class PlanResult:
 
     status: Status
     advice: str  # what to try next; "" if solved
-    # (P, D) waypoints of the shortened, verified path; of a failure, the best attempt. Joints
-    # without limits may leave [-pi, pi), so that waypoints can be interpolated.
+    # (P, D) waypoints of the shortened, verified path; of a failure, the best attempt. It starts
+    # exactly where it was told, in the same turn of joints without limits. These go on from there,
+    # so that waypoints can be interpolated: the path may end whole turns away from a joint goal.
     path: np.ndarray
-    trajectory: np.ndarray  # (T, D) the same path in the small steps that were verified
+    trajectory: np.ndarray  # (T, D) the same path in small steps
     raw_path: np.ndarray  # (P', D) as the tree has it
     target: np.ndarray  # (D,) what was planned to: the end of the path, unless there is none
     alternatives: np.ndarray  # (A, D) other configurations that meet the goal as well
@@ -64,6 +65,7 @@ class PlanResult:
     search_match_threshold: float  # the same in the search, which may use smaller images
     cost: float  # length of ``path`` in the world's metric [rad] or [m]
     verification: Verification | None  # None if there was no path to verify
+    refused: int  # paths that the exact check refused, before one passed or the plan gave up
     rejected: Mapping[str, int]  # lanes lost, by reason
     iterations: int
     expansions: int  # lanes tried
@@ -108,7 +110,7 @@ def rejected_lanes(found: SearchResult) -> dict[str, int]:
 
 
 def with_time_of(result: PlanResult, *results: PlanResult) -> PlanResult:
-    """A result that took the time, and the expansions, of all."""
+    """A result that took the time and the expansions of all, and counts what was refused in all."""
     timing: dict[str, Any] = {name: sum(r.timing[name] for r in results) for name in result.timing}
-    expansions = sum(r.expansions for r in results)
-    return dataclasses.replace(result, timing=timing, expansions=expansions)
+    counts = {name: sum(getattr(r, name) for r in results) for name in ("expansions", "refused")}
+    return dataclasses.replace(result, timing=timing, **counts)

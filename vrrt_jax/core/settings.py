@@ -6,6 +6,8 @@ import numbers
 from collections.abc import Mapping
 from typing import Any
 
+LARGEST = 2**31 - 1  # of whole numbers, which are int32 on the device
+
 
 def setting(
     default: Any,
@@ -14,17 +16,20 @@ def setting(
     *,
     below: bool = False,
     optional: bool = False,
+    endless: bool = False,
 ) -> Any:
     """A dataclass field with a default and a range.
 
     Args:
         default: the value that measures best.
         low: smallest value.
-        high: largest value.
+        high: largest value; of whole numbers at most :data:`LARGEST`.
         below: the value must stay below ``high``.
         optional: None is allowed too.
+        endless: infinity is allowed too.
     """
-    return dataclasses.field(default=default, metadata={"range": (low, high, below, optional)})
+    metadata = {"range": (low, high, below, optional), "endless": endless}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 def check_settings(settings: Any, prefix: str = "") -> None:
@@ -51,7 +56,9 @@ def check_settings(settings: Any, prefix: str = "") -> None:
             raise ValueError(
                 f"{prefix}{field.name}={value!r}; expected {'a whole' if whole else 'a'} number"
             )
-        if not low <= value <= high or (below and value == high):
+        high = min(high, LARGEST) if whole else high
+        endless = value == math.inf and not field.metadata["endless"]
+        if not low <= value <= high or (below and value == high) or endless:
             bracket = ")" if below else "]"
             raise ValueError(
                 f"{prefix}{field.name}={value} is out of range; expected [{low}, {high}{bracket}"

@@ -4,13 +4,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.edges import Edge, Space, distance, first_free_edge
+from vrrt_jax.core.edges import (
+    Edge,
+    Space,
+    StraightLineEdges,
+    distance,
+    first_free_edge,
+    steps_between,
+)
 from vrrt_jax.core.types import pytree
 
 LANES = 16  # candidates in a round
 PATIENCE = 6  # idle rounds after which it stops
 CHECKED = 8  # of those, the ones that save most are checked
 EDGE_STEPS = 128  # sub-steps of a candidate, so the longest is 128 times the resolution
+SAME = 1e-4  # [rad] or [m] waypoints nearer than this are one
 GAIN = 1e-3  # [rad] smallest saving worth a new corner
 PAYS = 2e-3  # share of the length; rounds that save less count as idle
 
@@ -99,6 +107,21 @@ def _round(world: Space, path: _Path, key: jax.Array) -> _Path:
         idle=jnp.where(pays, 0, path.idle + 1),
         round=path.round + 1,
     )
+
+
+def without_repeats(world: StraightLineEdges, path: np.ndarray) -> np.ndarray:
+    """The path (P, D) without waypoints that repeat the one before; its ends stay.
+
+    Waypoints whose joints are all within :data:`SAME` are one.
+    """
+    path, kept = np.asarray(path, np.float32), [0]
+    for index in range(1, len(path)):
+        if np.abs(steps_between(world, path[kept[-1]], path[index])).max() > SAME:
+            kept.append(index)
+    # The end takes the place of a waypoint that it repeats, unless that is the start.
+    if len(kept) > 1:
+        kept[-1] = len(path) - 1
+    return path[kept]
 
 
 def _rows(edge: Edge, index: jax.Array) -> Edge:

@@ -1,15 +1,16 @@
-"""The convex pieces that a robot's collision geoms are made of."""
+"""Convex polytopes, and unions of them: depths, surfaces, and spheres that contain these."""
 
 import dataclasses
+import functools
 
-import mujoco
 import numpy as np
-from scipy.spatial import ConvexHull, HalfspaceIntersection
+from scipy.spatial import ConvexHull
 
 STEP = 1e-4  # [m] centers and radii of fitted spheres are multiples of this
-_MAX_FACES = 400  # hulls with more are simplified, outwards
-_BLOCK = 10_000_000  # numbers in memory at once
-_ROUND_SIDES = 20  # sides of the prism around a cylinder, 1.2 % wider; 2.5 % for other round shapes
+_MAX_FACES = 1000  # for depths, hulls with more are simplified, inwards
+_INWARDS = (1e-3, 5e-3)  # by so much at most: [m], and of the size
+_NUM_EXTREMES = 400  # directions in which a hull that is simplified keeps its farthest point
+_BLOCK = 2_000_000  # numbers in memory at once
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -18,36 +19,81 @@ class Piece:
 
     vertices: np.ndarray  # (V, 3) [m]
     triangles: np.ndarray  # (F, 3) int, indices into ``vertices``
-    normals: np.ndarray  # (F, 3) outward unit normals
-    offsets: np.ndarray  # (F,) a point is inside where normals @ x <= offsets
+    # A point is inside where normals @ x <= offsets. For the hull of a fine mesh, these are the
+    # faces of a simpler polytope just inside.
+    normals: np.ndarray  # (f, 3) outward unit normals
+    offsets: np.ndarray  # (f,) [m]
+    excess: float = 0.0  # how far the polytope sticks out of the true shape at most [m]
+
+    @functools.cached_property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners (3,) and (3,) of the box around it [m]."""
+        corners = self.vertices[np.unique(self.triangles)]
+        return corners.min(axis=0), corners.max(axis=0)
 
     def depth(self, points: np.ndarray) -> np.ndarray:
         """Distance (n,) from points (n, 3) inside to the surface [m]; negative outside."""
-        blocks = np.array_split(points, 1 + points.shape[0] * len(self.offsets) // _BLOCK)
+        blocks = _blocks(points, len(self.offsets))
         return np.concatenate(
             [np.min(self.offsets - block @ self.normals.T, axis=1) for block in blocks]
         )
 
 
-def piece_of(points: np.ndarray) -> Piece:
-    """The convex hull of points (n, 3) [m], or, of fine ones, a polytope just around it."""
+def piece_of(points: np.ndarray, excess: float = 0.0) -> Piece:
+    """The convex hull of points (n, 3) [m].
+
+    Args:
+        points: of one shape.
+        excess: how far their hull sticks out of the true shape at most [m].
+    """
     hull = ConvexHull(points)
-    if len(hull.simplices) > _MAX_FACES:
-        # The half-spaces that touch the hull in fixed directions make up a simpler polytope.
-        vertices = points[hull.vertices]
-        reach = np.max(vertices @ _DIRECTIONS.T, axis=0)
-        planes = np.column_stack([_DIRECTIONS, -reach])
-        hull = ConvexHull(HalfspaceIntersection(planes, vertices.mean(axis=0)).intersections)
+    inner = _simpler(points[hull.vertices]) if len(hull.simplices) > _MAX_FACES else hull
+    planes = np.unique(np.round(inner.equations, 12), axis=0)
     return Piece(
         vertices=hull.points,
         triangles=hull.simplices,
-        normals=hull.equations[:, :3],
-        offsets=-hull.equations[:, 3],
+        normals=planes[:, :3],
+        offsets=-planes[:, 3],
+        excess=excess,
     )
 
 
-def _sphere_directions(num: int) -> np.ndarray:
-    """Unit vectors (num, 3), evenly spread on a spiral, and the six along the axes."""
+def _simpler(vertices: np.ndarray) -> ConvexHull:
+    """The hull of some vertices (n, 3) of a hull, which contains all of them but for a little."""
+    size = np.ptp(vertices, axis=0).max()
+    tolerance = min(_INWARDS[0], _INWARDS[1] * size)
+    # Extremes in all directions, of the shape made round: a long one would lose its sides.
+    middle = vertices - vertices.mean(axis=0)
+    spread, axes = np.linalg.eigh(middle.T @ middle / len(middle))
+    round_shape = middle @ axes / np.sqrt(np.maximum(spread, 1e-12 * spread.max()))
+    directions = _blocks(sphere_directions(_NUM_EXTREMES), len(vertices))
+    kept = np.unique(np.concatenate([(d @ round_shape.T).argmax(axis=1) for d in directions]))
+    inner = ConvexHull(vertices[kept])
+    while True:
+        # Take in what sticks out most of each face.
+        missed = [_farthest(vertices, block) for block in _blocks(inner.equations, len(vertices))]
+        farthest, beyond = (np.concatenate(part) for part in zip(*missed, strict=True))
+        more = np.setdiff1d(farthest[beyond > tolerance], kept)
+        if not len(more):
+            return inner
+        kept = np.union1d(kept, more)
+        inner = ConvexHull(vertices[kept])
+
+
+def _farthest(vertices: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of each plane (p, 4) the vertex (p,) that is farthest outside, and how far (p,) [m]."""
+    beyond = planes[:, :3] @ vertices.T
+    farthest = beyond.argmax(axis=1)
+    return farthest, beyond[np.arange(len(planes)), farthest] + planes[:, 3]
+
+
+def _blocks(rows: np.ndarray, width: int) -> list[np.ndarray]:
+    """Rows in blocks, so that so many numbers for each row fit into memory."""
+    return np.array_split(rows, 1 + len(rows) * width // _BLOCK)
+
+
+def sphere_directions(num: int) -> np.ndarray:
+    """Unit vectors (num + 6, 3), evenly spread on a spiral, and the six along the axes."""
     height = 1.0 - (2.0 * np.arange(num) + 1.0) / num
     angle = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(num)
     radius = np.sqrt(1.0 - height**2)
@@ -55,73 +101,15 @@ def _sphere_directions(num: int) -> np.ndarray:
     return np.vstack([spiral, np.eye(3), -np.eye(3)])
 
 
-_DIRECTIONS = _sphere_directions(200)
+def surface_area(pieces: list[Piece]) -> float:
+    """Sum of the surfaces of all pieces [m^2]."""
+    return float(sum(_areas(piece).sum() for piece in pieces))
 
 
-def collision_pieces(model: mujoco.MjModel) -> dict[int, list[Piece]]:
-    """Convex pieces of every body with collision geoms.
-
-    Args:
-        model: a compiled robot.
-
-    Returns:
-        Pieces by body index, in the frame of the body.
-
-    Raises:
-        ValueError: a geom has a shape that has no convex hull here.
-    """
-    pieces: dict[int, list[Piece]] = {}
-    for geom in range(model.ngeom):
-        if not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
-            continue
-        rotation = np.zeros(9)
-        mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-        points = _geom_points(model, geom) @ rotation.reshape(3, 3).T + model.geom_pos[geom]
-        pieces.setdefault(int(model.geom_bodyid[geom]), []).append(piece_of(points))
-    return pieces
-
-
-def _geom_points(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Points (n, 3) whose convex hull contains the geom, in the geom's frame [m]."""
-    kinds = mujoco.mjtGeom
-    kind, size = model.geom_type[geom], model.geom_size[geom]
-    if kind == kinds.mjGEOM_MESH:
-        mesh = model.geom_dataid[geom]
-        start = model.mesh_vertadr[mesh]
-        return np.asarray(model.mesh_vert[start : start + model.mesh_vertnum[mesh]], np.float64)
-    if kind == kinds.mjGEOM_BOX:
-        return _corners() * size
-    if kind == kinds.mjGEOM_CYLINDER:
-        return np.vstack([_circle(size[0], z) for z in (-size[1], size[1])])
-    if kind == kinds.mjGEOM_SPHERE:
-        return _ball() * size[0]
-    if kind == kinds.mjGEOM_ELLIPSOID:
-        return _ball() * size
-    if kind == kinds.mjGEOM_CAPSULE:
-        ball = _ball() * size[0]
-        return np.vstack([ball + [0, 0, z] for z in (-size[1], size[1])])
-    name = model.body(model.geom_bodyid[geom]).name
-    raise ValueError(
-        f"a collision geom of body '{name}' is a {kinds(kind).name[7:].lower()}; expected sphere, "
-        "box, capsule, cylinder, ellipsoid or mesh: replace it"
-    )
-
-
-def _corners() -> np.ndarray:
-    return np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3).astype(float)
-
-
-def _circle(radius: float, z: float) -> np.ndarray:
-    angle = np.arange(_ROUND_SIDES) * (2 * np.pi / _ROUND_SIDES)
-    radius = radius / np.cos(np.pi / _ROUND_SIDES)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(_ROUND_SIDES, z)], -1)
-
-
-def _ball() -> np.ndarray:
-    """Vertices (n, 3) of a polytope around the unit sphere."""
-    rings = np.linspace(-np.pi / 2, np.pi / 2, _ROUND_SIDES // 2 + 1)
-    points = np.vstack([_circle(np.cos(a), np.sin(a)) for a in rings])
-    return points / np.cos(np.pi / _ROUND_SIDES)
+def _areas(piece: Piece) -> np.ndarray:
+    corners = piece.vertices[piece.triangles]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.linalg.norm(cross, axis=1) / 2
 
 
 def surface_samples(pieces: list[Piece], spacing: float, rng: np.random.Generator) -> np.ndarray:
@@ -139,8 +127,7 @@ def surface_samples(pieces: list[Piece], spacing: float, rng: np.random.Generato
     for index, piece in enumerate(pieces):
         # Triangles are drawn by their area, so that the points are spread evenly.
         corners = piece.vertices[piece.triangles]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = np.linalg.norm(cross, axis=1) / 2
+        area = _areas(piece)
         count = int(np.ceil(area.sum() / spacing**2)) + 50
         face = rng.choice(len(area), count, p=area / area.sum())
         # Uniform in a triangle, by barycentric weights.
@@ -150,13 +137,31 @@ def surface_samples(pieces: list[Piece], spacing: float, rng: np.random.Generato
         points = np.vstack([points, piece.vertices[np.unique(piece.triangles)]])
         # What lies inside another piece is not surface of the union.
         others = [other for k, other in enumerate(pieces) if k != index]
-        found.append(points[union_depth(others, points) < 1e-6] if others else points)
+        found.append(points[~is_inside(others, points[:, None], 1e-6)])
     return np.vstack(found)
 
 
 def union_depth(pieces: list[Piece], points: np.ndarray) -> np.ndarray:
     """Depth (n,) of points (n, 3) below the surface of the deepest piece [m]; negative outside."""
     return np.max([piece.depth(points) for piece in pieces], axis=0)
+
+
+def is_inside(pieces: list[Piece], groups: np.ndarray, depth: float = 0.0) -> np.ndarray:
+    """Which groups (n, k, 3) of k points lie in one of some pieces as a whole, (n,) bool.
+
+    Args:
+        pieces: none or more.
+        groups: [m].
+        depth: how deep they must be [m].
+    """
+    inside = np.zeros(len(groups), bool)
+    for piece in pieces:
+        # Few points are anywhere near a piece.
+        low, high = piece.bounds
+        near = np.flatnonzero(~inside & ((groups >= low) & (groups <= high)).all(axis=(1, 2)))
+        depths = piece.depth(groups[near].reshape(-1, 3)).reshape(groups[near].shape[:2])
+        inside[near] = depths.min(axis=1, initial=np.inf) >= depth
+    return inside
 
 
 def contain_surface(
@@ -178,27 +183,31 @@ def contain_surface(
         Centers (n, 3) and radii (n,) [m].
     """
     centers = np.round(centers / STEP) * STEP
+    size = 1 + _BLOCK // (9 * len(radii))
     for piece in pieces:
-        triangles = piece.vertices[piece.triangles]
         others = [other for other in pieces if other is not piece]
-        while len(triangles):
+        stack = [piece.vertices[piece.triangles]]
+        while stack:
+            # A block at a time, the smallest triangles first, so that memory is bounded.
+            triangles = stack.pop()
+            if len(triangles) > size:
+                stack.append(triangles[size:])
+                triangles = triangles[:size]
             # A triangle is bare if no sphere holds all of its corners.
             corner_distance = np.linalg.norm(triangles[:, :, None] - centers, axis=-1)
-            # Without other pieces all corners are surface: close gaps before triangles are split.
-            if not others:
-                radii = grow(corner_distance.reshape(-1, len(radii)), radii)
+            # Close gaps before triangles are split. What lies inside another piece is not surface.
+            to_corners = corner_distance.reshape(-1, len(radii))
+            radii = grow(to_corners[~is_inside(others, triangles.reshape(-1, 1, 3))], radii)
             distance = corner_distance.max(1)
             is_bare = (distance > radii).all(1)
-            # What lies inside another piece is not surface, and may stay bare.
-            for other in others:
-                corners = triangles[is_bare].reshape(-1, 3)
-                is_bare[is_bare] = other.depth(corners).reshape(-1, 3).min(1) < 0
+            is_bare[is_bare] = ~is_inside(others, triangles[is_bare])
             triangles, distance = triangles[is_bare], distance[is_bare]
-            # Leaves are taken in by growing spheres; larger triangles are split in four.
+            # Leaves are taken in by growing spheres; larger triangles are split in two.
             edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=-1)
             is_leaf = edges.max(1, initial=0) < leaf
             radii = grow(distance[is_leaf], radii)
-            triangles = _split(triangles[~is_leaf])
+            if not is_leaf.all():
+                stack.append(split_triangles(triangles[~is_leaf]))
     return centers, np.ceil(radii / STEP - 1e-9) * STEP
 
 
@@ -226,9 +235,11 @@ def grow(distance: np.ndarray, radii: np.ndarray) -> np.ndarray:
     return radii
 
 
-def _split(triangles: np.ndarray) -> np.ndarray:
-    """Four triangles (4 n, 3, 3) for each of (n, 3, 3)."""
-    a, b, c = (triangles[:, k] for k in range(3))
-    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-    corners = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
-    return np.concatenate([np.stack(corner, axis=1) for corner in corners])
+def split_triangles(triangles: np.ndarray) -> np.ndarray:
+    """Triangles (n, 3, 3) cut in two at the middle of their longest edge, (2 n, 3, 3)."""
+    edges = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=-1)
+    # Corners in the order that begins with the longest edge: from a to b.
+    order = (edges.argmax(axis=1)[:, None] + np.arange(3)) % 3
+    a, b, c = (triangles[np.arange(len(triangles)), order[:, k]] for k in range(3))
+    middle = (a + b) / 2
+    return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])

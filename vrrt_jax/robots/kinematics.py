@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import pytree, static
 
 
@@ -54,6 +55,7 @@ class BodySpheres:
     radius: np.ndarray  # (n,) [m]
 
 
+@single_precision
 def link_poses(chain: Chain, q: jax.Array) -> jax.Array:
     """World poses of all links.
 
@@ -78,7 +80,8 @@ def link_poses(chain: Chain, q: jax.Array) -> jax.Array:
     return jnp.stack(poses)
 
 
-batch_link_poses = jax.jit(jax.vmap(link_poses, (None, 0)))  # of q (n, D), for the host
+# Of q (n, D), for the host.
+batch_link_poses = single_precision(jax.jit(jax.vmap(link_poses, (None, 0))))
 
 
 def _product(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -163,6 +166,7 @@ def body_links(model: mujoco.MjModel) -> np.ndarray:
     return link
 
 
+@single_precision
 def chain_from_model(model: mujoco.MjModel) -> tuple[Chain, np.ndarray, np.ndarray]:
     """Read the chain from a model with hinge and slide joints on a fixed base.
 

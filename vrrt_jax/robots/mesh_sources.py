@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import mujoco
 
 from vrrt_jax.robots import mjcf
+from vrrt_jax.robots.frozen import freeze_joints
 
 if TYPE_CHECKING:
     from vrrt_jax.robots.robot import Robot
@@ -121,7 +122,7 @@ def mesh_spec(robot: "Robot", *, visuals: bool = True) -> mujoco.MjSpec | None:
     if source and source.hulls:
         mjcf.collide_visuals(spec)
     mjcf.strip_spec(spec, visuals=visuals)
-    mjcf.freeze_joints(spec, frozen_joints(robot))
+    freeze_joints(spec, frozen_joints(robot))
     for first, second in source.exclude if source else ():
         spec.add_exclude(bodyname1=first, bodyname2=second)
     return spec

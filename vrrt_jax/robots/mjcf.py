@@ -1,19 +1,18 @@
 """Read any MJCF or URDF robot and reduce it to what planning needs."""
 
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
+from vrrt_jax.robots import urdf
+from vrrt_jax.robots.names import free_name
+
 _TOOL = "tool_"  # two models may use a name twice
+_WRAPS_JOINT = mujoco.mjtWrap.mjWRAP_JOINT
 _SEEN, _HIDDEN = 1, 3  # groups of geoms: drawn, and not
-_UNPLANNED = {
-    int(mujoco.mjtJoint.mjJNT_FREE): "free",
-    int(mujoco.mjtJoint.mjJNT_BALL): "ball",
-}
 
 
 def read_spec(path: Path, *, visuals: bool = False) -> mujoco.MjSpec:
@@ -26,10 +25,16 @@ def read_spec(path: Path, *, visuals: bool = False) -> mujoco.MjSpec:
     Raises:
         ValueError: the file is not readable as a robot.
     """
+    path = Path(path)
+    try:
+        root = urdf.urdf_root(path)
+        if root is None:
+            return _plain(mujoco.MjSpec.from_file(str(path)))
+    except ValueError as error:
+        raise ValueError(_unreadable(path, error)) from None
     if visuals:
         try:
-            if spec := _urdf_with_visuals(path):
-                return spec
+            return _with_visuals(root, path)
         except ValueError as error:
             warnings.warn(
                 f"{_unreadable(path, error)}; its collision shapes are drawn instead of its visual "
@@ -37,27 +42,14 @@ def read_spec(path: Path, *, visuals: bool = False) -> mujoco.MjSpec:
                 stacklevel=3,
             )
     try:
-        return _plain(mujoco.MjSpec.from_file(str(path)))
+        return _plain(urdf.urdf_spec(root, path, visuals=False))
     except ValueError as error:
         raise ValueError(_unreadable(path, error)) from None
 
 
-def _urdf_with_visuals(path: Path) -> mujoco.MjSpec | None:
-    """A URDF with the geoms that MuJoCo leaves out by default; None for another file."""
-    try:
-        root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError:
-        return None
-    if root.tag != "robot":
-        return None
-    compiler = root
-    for tag in ("mujoco", "compiler"):
-        found = compiler.find(tag)
-        compiler = ElementTree.SubElement(compiler, tag) if found is None else found
-    compiler.set("discardvisual", "false")
-    spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
-    spec.modelfiledir = str(path.resolve().parent)
-    spec = _plain(spec)
+def _with_visuals(root: ElementTree.Element, path: Path) -> mujoco.MjSpec:
+    """A URDF with the geoms that are for the eye; what collides is hidden where there are some."""
+    spec = _plain(urdf.urdf_spec(root, path, visuals=True))
     for body in spec.bodies:
         if not all(map(_collides, body.geoms)):
             for geom in body.geoms:
@@ -76,8 +68,9 @@ def _plain(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     # A URDF fuses links without a joint of their own into their parents: their names would be lost.
     spec.compiler.fusestatic = False
     for kind, elements in (("body", spec.bodies), ("joint", spec.joints)):
+        taken = {element.name for element in elements}
         for index, element in enumerate(elements):
-            element.name = element.name or f"{kind}_{index}"
+            element.name = element.name or free_name(f"{kind}_{index}", taken)
     # Only kinematics is used; a URDF link without <inertial> would not compile.
     for body in spec.bodies[1:]:
         body.explicitinertial = True
@@ -168,16 +161,57 @@ def collide_visuals(spec: mujoco.MjSpec) -> None:
             spec.delete(geom)
 
 
-def warn_of_loops(spec: mujoco.MjSpec) -> None:
-    """Tell which closed loops of linkages come open, as only trees of joints are planned."""
+def warn_of_what_is_lost(spec: mujoco.MjSpec) -> None:
+    """Tell what ties joints or shapes together in a file, and is not kept.
+
+    Only trees of joints are planned, so that loops of linkages come open. Joints that an equality
+    couples are another matter, see :func:`vrrt_jax.robots.frozen.frozen_positions`.
+    """
     loops = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
-    pairs = [f"{e.name1} and {e.name2}" for e in spec.equalities if e.type in loops]
-    if pairs:
+    active = [equality for equality in spec.equalities if equality.active]
+    ties = [f"{e.name1} and {e.name2}" for e in active if e.type in loops]
+    tendons = {tendon.name: tendon for tendon in spec.tendons}
+    for equality in active:
+        if equality.type == mujoco.mjtEq.mjEQ_TENDON:
+            names = [name for name in (equality.name1, equality.name2) if name]
+            ties.append(" and ".join(_tendon(tendons[name]) for name in names))
+    if ties:
         warnings.warn(
-            f"what ties {'; '.join(pairs)} together is not kept: fix the joints of such a linkage "
+            f"what ties {'; '.join(ties)} together is not kept: fix the joints of such a linkage "
             "with freeze, or they move each by itself",
             stacklevel=3,
         )
+    bounded = [tendon for tendon in spec.tendons if _is_limited(tendon)]
+    if bounded:
+        warnings.warn(
+            f"the limits of {'; '.join(map(_tendon, bounded))} are not kept: the joints move "
+            "within their own limits",
+            stacklevel=3,
+        )
+    alone = [g.name for g in spec.geoms if not _collides(g) and _is_paired(spec, g.name)]
+    if alone:
+        warnings.warn(
+            f"geoms {', '.join(alone)} collide by contact pairs only, which are not kept: give "
+            "them contype and conaffinity, or the robot is planned without them",
+            stacklevel=3,
+        )
+
+
+def _tendon(tendon: mujoco.MjsTendon) -> str:
+    """Words for a tendon: "tendon 't' (joints a, b)"."""
+    joints = [str(wrap.target.name) for wrap in tendon.path if wrap.type == _WRAPS_JOINT]
+    return f"tendon '{tendon.name}'" + (f" (joints {', '.join(joints)})" if joints else "")
+
+
+def _is_limited(tendon: mujoco.MjsTendon) -> bool:
+    is_auto = tendon.limited == mujoco.mjtLimited.mjLIMITED_AUTO
+    return bool(tendon.limited == mujoco.mjtLimited.mjLIMITED_TRUE) or (
+        bool(is_auto) and tendon.range[0] < tendon.range[1]
+    )
+
+
+def _is_paired(spec: mujoco.MjSpec, name: str) -> bool:
+    return bool(name) and any(name in (pair.geomname1, pair.geomname2) for pair in spec.pairs)
 
 
 def strip_spec(spec: mujoco.MjSpec, *, visuals: bool) -> None:
@@ -185,11 +219,11 @@ def strip_spec(spec: mujoco.MjSpec, *, visuals: bool) -> None:
 
     Args:
         spec: as read from the file; keyframes and equalities of joints stay, see
-            :func:`freeze_joints`.
+            :func:`vrrt_jax.robots.frozen.freeze_joints`.
         visuals: keep the geoms that never collide, with their meshes and materials.
     """
     for equality in list(spec.equalities):
-        if equality.type != mujoco.mjtEq.mjEQ_JOINT:
+        if equality.type != mujoco.mjtEq.mjEQ_JOINT or not equality.active:
             spec.delete(equality)
     for name in ("tuples", "sensors", "actuators", "tendons", "pairs", "flexes", "skins"):
         _delete_all(spec, name)
@@ -217,146 +251,3 @@ def strip_spec(spec: mujoco.MjSpec, *, visuals: bool) -> None:
 def _delete_all(spec: mujoco.MjSpec, collection: str) -> None:
     for element in list(getattr(spec, collection)):
         spec.delete(element)
-
-
-def check_joints(model: mujoco.MjModel) -> None:
-    """Refuse joints that cannot be planned.
-
-    Raises:
-        ValueError: a joint is free or ball, a slide has no range, or there is no joint at all.
-    """
-    if model.njnt == 0:
-        raise ValueError(
-            "the robot has no joint: nothing to plan; expected at least one hinge or slide joint"
-        )
-    for joint in range(model.njnt):
-        name, kind = model.joint(joint).name, int(model.jnt_type[joint])
-        if kind in _UNPLANNED:
-            body = model.body(model.jnt_bodyid[joint]).name
-            raise ValueError(
-                f"joint '{name}' of body '{body}' is a {_UNPLANNED[kind]} joint; expected hinge "
-                "and slide joints on a fixed base: delete it, or replace it by hinges and slides"
-            )
-        if kind == mujoco.mjtJoint.mjJNT_SLIDE and not model.jnt_limited[joint]:
-            raise ValueError(
-                f"slide joint '{name}' has no range; expected range=\"lower upper\" [m]: add it, "
-                f"or fix the joint with freeze={{'{name}': 0.0}}"
-            )
-
-
-def joint_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper limits (D,) [rad] or [m]; -pi and pi for an unlimited hinge."""
-    limited = model.jnt_limited.astype(bool)
-    lower = np.where(limited, model.jnt_range[:, 0], -np.pi)
-    return lower, np.where(limited, model.jnt_range[:, 1], np.pi)
-
-
-def home_positions(model: mujoco.MjModel) -> dict[str, float]:
-    """Joint positions [rad] or [m] of the keyframe 'home', else of the first, else of the zero.
-
-    All are clipped to the limits.
-    """
-    names = [model.key(k).name for k in range(model.nkey)]
-    qpos = model.qpos0
-    if names:
-        qpos = model.key_qpos[names.index("home") if "home" in names else 0]
-    home = {}
-    for j in range(model.njnt):
-        position = qpos[model.jnt_qposadr[j]]
-        if model.jnt_limited[j]:
-            position = np.clip(position, *model.jnt_range[j])
-        home[model.joint(j).name] = float(position)
-    return home
-
-
-def frozen_positions(
-    model: mujoco.MjModel, home: Mapping[str, float], freeze: Mapping[str, float] | None
-) -> dict[str, float]:
-    """Which joints to fix, and where.
-
-    Args:
-        model: with all joints and equalities of the file.
-        home: position of each joint where the caller says nothing.
-        freeze: the caller's choice.
-
-    Returns:
-        Positions [rad] or [m] by joint: those of ``freeze``, and joints that an equality couples.
-
-    Raises:
-        ValueError: a joint of ``freeze`` does not exist, or its value is no finite number or
-            outside of its range.
-    """
-    names = [model.joint(j).name for j in range(model.njnt)]
-    frozen = dict(freeze or {})
-    for name, value in frozen.items():
-        if name not in names:
-            raise ValueError(f"freeze: joint '{name}' not in robot; have: {', '.join(names)}")
-        if not np.isfinite(value):
-            raise ValueError(
-                f"freeze: joint '{name}' got {value}; expected a finite position [rad] or [m]"
-            )
-        joint = model.joint(name)
-        low, high = joint.range
-        if model.jnt_limited[joint.id] and not low <= value <= high:
-            raise ValueError(
-                f"freeze: joint '{name}' got {value:g}; expected a position in its range, "
-                f"[{low:g}, {high:g}]"
-            )
-    coupled = {}
-    for k in range(model.neq):
-        if model.eq_type[k] == mujoco.mjtEq.mjEQ_JOINT:
-            for joint in (model.eq_obj1id[k], model.eq_obj2id[k]):
-                if joint >= 0 and names[joint] not in frozen:
-                    coupled[names[joint]] = home[names[joint]]
-    if coupled:
-        warnings.warn(
-            "joints coupled by an equality cannot be planned one by one and are fixed: "
-            + ", ".join(f"{name} = {value:g}" for name, value in coupled.items())
-            + "; pass freeze={joint: position} to choose other positions",
-            stacklevel=3,
-        )
-    return frozen | coupled
-
-
-def freeze_joints(spec: mujoco.MjSpec, positions: Mapping[str, float]) -> None:
-    """Delete equalities, keyframes and the given joints in place; their bodies move accordingly."""
-    for name in ("equalities", "keys"):  # they refer to joints
-        _delete_all(spec, name)
-    for joint in [joint for joint in spec.joints if joint.name in positions]:
-        position, body = positions[joint.name], joint.parent
-        if body.joints[0].name != joint.name:
-            raise ValueError(
-                f"cannot fix joint '{joint.name}': joint '{body.joints[0].name}' of the same body "
-                "comes before it and moves; give each joint a body of its own, or fix both"
-            )
-        if joint.type == mujoco.mjtJoint.mjJNT_SLIDE:
-            offset = (position - joint.ref) * joint.axis / np.linalg.norm(joint.axis)
-            rotation = np.array([1.0, 0.0, 0.0, 0.0])
-        else:
-            degree = np.pi / 180 if spec.compiler.degree else 1.0
-            rotation = np.zeros(4)
-            axis = joint.axis / np.linalg.norm(joint.axis)
-            mujoco.mju_axisAngle2Quat(rotation, axis, position - joint.ref * degree)
-            turned = np.zeros(3)
-            mujoco.mju_rotVecQuat(turned, joint.pos, rotation)
-            offset = joint.pos - turned
-        _move_body(spec, body, offset, rotation)
-        spec.delete(joint)
-
-
-def _move_body(
-    spec: mujoco.MjSpec, body: mujoco.MjsBody, offset: np.ndarray, rotation: np.ndarray
-) -> None:
-    """Append a motion, given in the body's own frame, to the body's pose."""
-    quaternion = np.array(body.quat)
-    if body.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT:
-        compiler = spec.compiler
-        quaternion = np.array(
-            spec.resolve_orientation(compiler.degree, compiler.eulerseq, body.alt)
-        )
-        body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-    shift, product = np.zeros(3), np.zeros(4)
-    mujoco.mju_rotVecQuat(shift, offset, quaternion)
-    mujoco.mju_mulQuat(product, quaternion, rotation)
-    body.pos = body.pos + shift
-    body.quat = product

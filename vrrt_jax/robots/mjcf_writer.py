@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from vrrt_jax.robots.kinematics import BodySpheres
+from vrrt_jax.robots.names import free_name
 
 # Robot spheres of two kinds and obstacles (contype=1 conaffinity=0) share a model. MuJoCo checks
 # a pair where one's contype meets the other's conaffinity: collision spheres against obstacles,
@@ -91,7 +92,7 @@ def source_of(spec: mujoco.MjSpec) -> tuple[str | None, dict[str, float]]:
 
 def _add_body(parent: ET.Element, model: mujoco.MjModel, body: int) -> ET.Element:
     """A body and its joints; each further joint gets a body of its own inside."""
-    name = model.body(body).name
+    name, names = model.body(body).name, {model.body(k).name for k in range(model.nbody)}
     joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
     element = ET.SubElement(parent, "body", name=name)
     if np.any(model.body_pos[body]):
@@ -101,7 +102,8 @@ def _add_body(parent: ET.Element, model: mujoco.MjModel, body: int) -> ET.Elemen
     for count, joint in enumerate(joints):
         if count:
             # the first keeps the plain name only if it is the last: that one carries the geoms
-            element.set("name", f"{name}__{model.joint(joint - 1).name}")
+            between = f"{name}__{model.joint(joint - 1).name}"
+            element.set("name", free_name(between, names))
             element = ET.SubElement(element, "body", name=name)
         _add_joint(element, model, joint)
     return element

@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from vrrt_jax.robots import mjcf, mjcf_writer, self_collision
+from vrrt_jax.core.precision import single_precision
+from vrrt_jax.robots import frozen as frozen_joints
+from vrrt_jax.robots import limits, mjcf, mjcf_writer, self_collision
 from vrrt_jax.robots.kinematics import (
     BodySpheres,
     Chain,
@@ -60,6 +62,7 @@ class Robot:
         return len(self.joint_names)
 
 
+@single_precision
 def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None = None) -> Robot:
     """Load a packaged robot, or any MJCF or URDF file with a fixed base.
 
@@ -73,8 +76,9 @@ def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None =
 
     Raises:
         FileNotFoundError: the path leads to no file.
-        ValueError: the name is unknown, the file is unreadable, a joint cannot be planned, or
-            ``freeze`` names a joint that does not exist or puts one outside of its range.
+        ValueError: the name is unknown, the file is unreadable, a mesh is nowhere, a joint cannot
+            be planned or its limits are unclear, or ``freeze`` names a joint that does not exist
+            or puts one outside of its range.
     """
     path = robot_path(name_or_path)
     spec = mjcf.read_spec(path)
@@ -122,6 +126,12 @@ def _prepare_self_collision(
         ignored_pairs: what the file excludes from contact.
         write: :func:`vrrt_jax.robots.mjcf_writer.collision_mjcf` but for the two results.
     """
+    if not self_collision.can_touch_itself(model):
+        warnings.warn(
+            "the contact bits of the robot let no two of its links touch: it is never checked "
+            'against itself; give its geoms contype="1" conaffinity="1" to have that checked',
+            stacklevel=3,
+        )
     # Bodies that never touch in random configurations, or nearly always, need no check.
     sample = self_collision.sample_self_collisions(model, _NUM_SAMPLES, np.random.default_rng(0))
     ignored = sorted({*ignored_pairs, *self_collision.find_ignored_pairs(model, sample)})
@@ -159,25 +169,26 @@ def _reduce(
     spec: mujoco.MjSpec, path: Path, freeze: Mapping[str, float] | None
 ) -> tuple[mujoco.MjModel, np.ndarray, dict[str, float]]:
     """The model with planned joints only, its home (D,), and the joints that were fixed."""
-    mjcf.warn_of_loops(spec)
+    mjcf.warn_of_what_is_lost(spec)
+    bad_ranges = limits.bad_ranges(spec, path)
     mjcf.strip_spec(spec, visuals=False)
     model = mjcf.compile_spec(spec, path)
-    home = mjcf.home_positions(model)
+    home = frozen_joints.home_positions(model)
     # A file that was written before says where the joints that it keeps are fixed.
     names = {model.joint(j).name for j in range(model.njnt)}
     _, before = mjcf_writer.source_of(spec)
     usual = {name: position for name, position in before.items() if name in names}
-    frozen = mjcf.frozen_positions(model, home, usual | dict(freeze or {}))
-    mjcf.freeze_joints(spec, frozen)
+    frozen = frozen_joints.frozen_positions(model, home, usual | dict(freeze or {}))
+    frozen_joints.freeze_joints(spec, frozen)
     model = mjcf.compile_spec(spec, path)
-    mjcf.check_joints(model)
+    limits.check_joints(model, bad_ranges)
     return model, np.array([home[model.joint(j).name] for j in range(model.njnt)]), frozen
 
 
 def _robot(*, model: mujoco.MjModel, **fields) -> Robot:
     """Assemble a robot from its compiled collision model."""
     chain, body_link, body_in_link = chain_from_model(model)
-    lower, upper = mjcf.joint_ranges(model)
+    lower, upper = limits.joint_ranges(model)
     geoms_of_kind, spheres = {}, {}
     for label, kind in (
         ("collision_sphere", mjcf_writer.COLLISION_GEOM),

@@ -6,7 +6,8 @@ from collections.abc import Callable
 import numpy as np
 
 from vrrt_jax.robots import mjcf_writer, sphere_fit
-from vrrt_jax.robots.convex_parts import collision_pieces, contain_surface
+from vrrt_jax.robots.convex_parts import contain_surface
+from vrrt_jax.robots.geom_pieces import collision_pieces
 from vrrt_jax.robots.kinematics import BodySpheres
 from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 from vrrt_jax.robots.robot import Robot

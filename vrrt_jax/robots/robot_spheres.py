@@ -10,6 +10,8 @@ from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.kinematics import BodySpheres
 from vrrt_jax.robots.sphere_cover import cover_convex_parts
 
+_MOST_SELF_COLLISION = 100  # self-collision spheres of one body
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RobotSpheres:
@@ -41,9 +43,12 @@ def spheres_of(model: mujoco.MjModel) -> RobotSpheres:
             "with contype or conaffinity: add them, or spheres"
         )
     if np.any(model.geom_type[geoms] != mujoco.mjtGeom.mjGEOM_SPHERE):
-        cover = cover_convex_parts(model)
+        cover = fine = cover_convex_parts(model)
+        # Every pair of self-collision spheres is checked: large bodies get fewer.
+        if np.bincount(cover.body).max() > _MOST_SELF_COLLISION:
+            cover = cover_convex_parts(model, most=_MOST_SELF_COLLISION)
         return RobotSpheres(
-            collision=_on_moving_bodies(model, cover), self_collision=cover, origin="fitted"
+            collision=_on_moving_bodies(model, fine), self_collision=cover, origin="fitted"
         )
     # A file that `vrrt spheres` wrote marks both kinds by their groups and contact bits.
     is_collision = _is_kind(model, geoms, mjcf_writer.COLLISION_GEOM)

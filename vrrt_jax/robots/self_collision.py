@@ -6,7 +6,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from vrrt_jax.robots.mjcf import joint_ranges
+from vrrt_jax.robots.limits import joint_ranges
 
 _NUM_DRAFT = 500  # configurations in which a draft of spheres is checked
 _ALWAYS = 0.98  # a pair of bodies that touches in a larger share of configurations is ignored
@@ -59,6 +59,16 @@ class SelfCollisions:
     touching: list[set[tuple[int, int]]]  # (n,) pairs of bodies that touch, smaller index first
 
 
+def can_touch_itself(model: mujoco.MjModel) -> bool:
+    """Whether the contact bits of any two links meet; true of a robot with one link only."""
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    geoms = np.flatnonzero(collides)
+    link = model.body_weldid[model.geom_bodyid[geoms]]
+    types, affinities = model.geom_contype[geoms], model.geom_conaffinity[geoms]
+    do_bits_meet = (types[:, None] & affinities) | (affinities[:, None] & types)
+    return bool(len(np.unique(link)) < 2 or np.any((do_bits_meet != 0) & (link[:, None] != link)))
+
+
 def sample_self_collisions(
     model: mujoco.MjModel, num: int, rng: np.random.Generator
 ) -> SelfCollisions:
@@ -86,7 +96,8 @@ def _count(sample: SelfCollisions) -> dict[tuple[int, int], int]:
 def find_ignored_pairs(model: mujoco.MjModel, sample: SelfCollisions) -> list[tuple[str, str]]:
     """Pairs of bodies that need no check: they never touch, or nearly always do.
 
-    A body and the base that carries it are among them: they share a joint.
+    A body and the one that carries it are among them, as they share a joint, where C MuJoCo does
+    not skip them by itself.
 
     Args:
         model: the robot with its true geometry.
@@ -97,13 +108,17 @@ def find_ignored_pairs(model: mujoco.MjModel, sample: SelfCollisions) -> list[tu
     weld = model.body_weldid
     ignored = []
     for a, b in ((int(a), int(b)) for a in bodies for b in bodies if a < b):
-        parents = weld[model.body_parentid[weld[[a, b]]]]
-        # Bodies welded together, and neighbors along the chain: C MuJoCo skips them by itself.
-        if weld[a] == weld[b] or (weld[a] and weld[b] and weld[b] == parents[0]):
+        first, second = weld[a], weld[b]
+        parents = weld[model.body_parentid[[first, second]]]
+        # Bodies welded together: C MuJoCo skips them by itself.
+        if first == second:
             continue
-        if weld[a] and weld[b] and weld[a] == parents[1]:
+        # Neighbors along the chain: C MuJoCo skips them too, but for those of the base. A body with
+        # several joints is written as several, which puts the carrier out of MuJoCo's sight.
+        is_joined = second == parents[0] or first == parents[1]
+        child = first if second == parents[0] else second
+        if is_joined and first and second and model.body_jntnum[child] == 1:
             continue
-        is_joined = weld[a] == 0 and parents[1] == 0
         if is_joined or not 0 < count.get((a, b), 0) < _ALWAYS * len(sample.q):
             ignored.append((model.body(a).name, model.body(b).name))
     return ignored

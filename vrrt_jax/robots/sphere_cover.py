@@ -16,24 +16,20 @@ This module is not :mod:`vrrt_jax.robots.sphere_fit`, which spends minutes on th
 the command ``vrrt spheres``.
 """
 
+import warnings
+from collections.abc import Iterator
+
 import mujoco
 import numpy as np
 
-from vrrt_jax.robots.convex_parts import (
-    Piece,
-    collision_pieces,
-    contain_surface,
-    surface_samples,
-    union_depth,
-)
+from vrrt_jax.robots.bounded_cover import cover_within
+from vrrt_jax.robots.geom_pieces import collision_pieces
 from vrrt_jax.robots.kinematics import BodySpheres
 
-_SURFACE_SPACING = 0.004  # [m] between surface samples
-_MAX_SURFACE_POINTS = 2000  # of a body
-_NUM_CANDIDATES = 600  # centers tried in each convex piece
-_LEAF = 2e-3  # [m] size of the smallest triangle when the cover is proven
-_MAX_BULGE = 0.03  # [m] how far spheres stick out at most
+MAX_BULGE = 0.03  # [m] how far spheres stick out of the bodies of a loaded robot at most
+_FINE_BULGE, _FEW_SPHERES = 0.02, 12  # [m] of a body that so many spheres are enough for
 _RELATIVE_BULGE = 0.1  # of the extent of the body, if that is less
+MOST_SPHERES = 2000  # of one body
 _ROUNDING = 1e-6  # a length is divided into n parts if it exceeds n parts by less
 
 
@@ -114,11 +110,15 @@ def cover_geom(
     raise ValueError(f"geom of kind {kind.name}: expected spheres, capsules and boxes")
 
 
-def cover_convex_parts(model: mujoco.MjModel) -> BodySpheres:
+def cover_convex_parts(model: mujoco.MjModel, *, most: int = MOST_SPHERES) -> BodySpheres:
     """Spheres that cover all collision geoms of a model, whatever their shapes.
+
+    They stick out of each body by at most 10 % of its extent, and by at most 3 cm, if ``most`` of
+    them are enough for that. Bodies made of spheres keep these.
 
     Args:
         model: a compiled robot.
+        most: number of spheres that no body has more of.
 
     Returns:
         The spheres, body by body; the same for the same model.
@@ -135,58 +135,39 @@ def cover_convex_parts(model: mujoco.MjModel) -> BodySpheres:
     owners, centers, radii = [], [], []
     for body, pieces in pieces_of_bodies.items():
         # Small bodies get a fine cover, but the smallest must not use up most of the spheres.
-        bulge = max(extents[body], max(extents.values()) / 2) * _RELATIVE_BULGE
-        own_centers, own_radii = cover_body(pieces, min(bulge, _MAX_BULGE), rng)
-        owners.append(np.full(len(own_radii), body))
-        centers.append(own_centers)
-        radii.append(own_radii)
+        fine = max(extents[body], max(extents.values()) / 2) * _RELATIVE_BULGE
+        found, bulge = _own_spheres(model, body), 0.0
+        for wanted, enough in _choices(most):
+            if found is None:
+                bulge = min(wanted, fine) if wanted <= MAX_BULGE else wanted
+                found = cover_within(pieces, bulge, rng, most=enough)
+        assert found is not None  # as the coarsest spheres are larger than any robot
+        if bulge > MAX_BULGE and most == MOST_SPHERES:
+            warnings.warn(
+                f"body '{model.body(body).name}' is so large that {most} spheres, the most for one "
+                f"body, stick out of it by up to {bulge:g} m; expected {MAX_BULGE} m: the planner "
+                "refuses what is nearer; give the body simpler shapes, or check the file's units",
+                stacklevel=5,
+            )
+        owners.append(np.full(len(found[1]), body))
+        centers.append(found[0])
+        radii.append(found[1])
     return BodySpheres(body=np.hstack(owners), center=np.vstack(centers), radius=np.hstack(radii))
 
 
-def cover_body(
-    pieces: list[Piece], bulge: float, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Greedy medial spheres that contain the surface of a body.
+def _choices(most: int) -> Iterator[tuple[float, int]]:
+    """How far spheres may stick out [m], and how many there may be: finer ones if few are enough.
 
-    Args:
-        pieces: convex pieces of the body.
-        bulge: how far a chosen sphere sticks out of the piece that it lies in [m]. Some spheres
-            grow beyond it at last, to close gaps between the samples of the surface.
-        rng: source of randomness.
-
-    Returns:
-        Centers (n, 3) and radii (n,) [m].
+    The bulge doubles where ``most`` spheres are not enough for :data:`MAX_BULGE`.
     """
-    surface = surface_samples(pieces, _SURFACE_SPACING, rng)
-    if len(surface) > _MAX_SURFACE_POINTS:
-        surface = surface[rng.choice(len(surface), _MAX_SURFACE_POINTS, replace=False)]
-    # Candidates: inner points, each with the largest sphere that sticks out by the bulge.
-    centers = np.vstack([_inner_points(piece, rng) for piece in pieces])
-    radii = union_depth(pieces, centers) + bulge
-    is_covered_by = np.linalg.norm(surface[:, None] - centers, axis=-1) <= radii
-    # Greedy set cover: take the candidate that covers most of what is bare, until all is covered.
-    chosen = []
-    while len(is_covered_by):
-        best = int(np.argmax(is_covered_by.sum(0)))
-        if not is_covered_by[:, best].any():
-            break
-        chosen.append(best)
-        is_covered_by = is_covered_by[~is_covered_by[:, best]]
-    # Samples prove nothing between them: grow the spheres until they provably contain the surface.
-    return contain_surface(pieces, centers[chosen], radii[chosen], leaf=_LEAF)
+    yield _FINE_BULGE, min(most, _FEW_SPHERES)
+    yield from ((MAX_BULGE * 2**k, most) for k in range(20))
 
 
-def _inner_points(piece: Piece, rng: np.random.Generator) -> np.ndarray:
-    """Points (n, 3) where spheres may be centered, most of them far from the surface."""
-    corners = piece.vertices[np.unique(piece.triangles)]
-    points = rng.dirichlet(np.full(len(corners), 0.3), _NUM_CANDIDATES) @ corners
-    spread = np.ptp(corners, axis=0).max() / 10
-    # A random walk uphill in depth, towards the medial axis. Some points stop early, so that
-    # candidates are found between the surface and the axis too.
-    for _ in range(30):
-        moved = points + rng.normal(size=points.shape) * spread
-        better = piece.depth(moved) > piece.depth(points)
-        better &= rng.random(len(points)) > 0.1
-        points = np.where(better[:, None], moved, points)
-        spread *= 0.9
-    return points
+def _own_spheres(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Centers (n, 3) and radii (n,) of the geoms of a body; None if some are no spheres [m]."""
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    geoms = np.flatnonzero(collides & (model.geom_bodyid == body))
+    if np.any(model.geom_type[geoms] != mujoco.mjtGeom.mjGEOM_SPHERE):
+        return None
+    return model.geom_pos[geoms], model.geom_size[geoms, 0]

@@ -18,7 +18,7 @@ import optax
 from scipy.spatial import KDTree
 
 from vrrt_jax.robots.convex_parts import Piece, grow, surface_samples, union_depth
-from vrrt_jax.robots.mjcf import joint_ranges
+from vrrt_jax.robots.limits import joint_ranges
 
 MAX_SPHERES = 8  # of one body
 _STARTS = 8

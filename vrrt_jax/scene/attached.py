@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots.kinematics import chain_from_model
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.held import Grip, HeldObject, HeldSpheres
@@ -28,6 +29,7 @@ TOLERANCE = 1e-3  # [m] how much deeper it may be from then on
 _ROUNDING = 1e-4  # [m] of the distances of spheres where the object is gripped
 
 
+@single_precision
 def attach(
     world: World,
     obstacle: str | Obstacle,
@@ -40,9 +42,9 @@ def attach(
     The object is checked against all obstacles, against all other links of the robot, and against
     what these hold. It may touch whatever the same joint carries: the hand and its fingers.
 
-    The planner sees spheres around the object, 24 at most. They stick out of it by 1 cm, of objects
-    that are larger than a hand by more; ``world.attached[-1].bulge`` says by how much. The exact
-    check sees the object itself.
+    The planner sees spheres around the object: 24 at most that stick out of it by 1 cm, of objects
+    that are larger than a hand by up to 3 cm, and around large plates more of them.
+    ``world.attached[-1].bulge`` says how far. The exact check sees the object itself.
 
     An object often stands on something where it is gripped, and is modeled to sink in a little. So
     from then on the object may be as deep in each obstacle as it was at ``q``, and 1 mm more. That
@@ -87,6 +89,7 @@ def attach(
     return world.holding([*world.attached, held])
 
 
+@single_precision
 def detach(world: World, name: str, *, q: Sequence[float] | np.ndarray | None = None) -> World:
     """Let go of an object that :func:`attach` gave to the robot.
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from vrrt_jax.core.check_protocols import overrides_is_free
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import TraceIgnoredNames, pytree
 from vrrt_jax.robots.kinematics import link_poses, place
 from vrrt_jax.scene.held import HeldObject
@@ -27,6 +28,7 @@ class ClosedFormWorld(World):
 
     spheres: WorldSpheres
 
+    @single_precision
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.is_free`."""
         poses, spheres = link_poses(self.chain, q), self.spheres
@@ -47,6 +49,7 @@ class ClosedFormWorld(World):
         centers = place(spheres.collision, poses), place(spheres.self_collision, poses)
         return spheres.free_span(self.obstacles, self.margin, centers, edge)
 
+    @single_precision
     def obstacle_clearance(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.obstacle_clearance`."""
         return self.spheres.smallest_clearance(self.obstacles, link_poses(self.chain, q))

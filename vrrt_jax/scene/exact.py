@@ -1,8 +1,10 @@
 """A robot among obstacles in C MuJoCo, with its true meshes where this machine has them."""
 
+import copy
 import dataclasses
 import functools
 import threading
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 
 import mujoco
@@ -11,6 +13,7 @@ import numpy as np
 from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 from vrrt_jax.robots.robot import Robot
+from vrrt_jax.scene.advance import NEAR, Near, near_pairs
 from vrrt_jax.scene.exact_held import HELD_BITS, add_held, allowed_depths
 from vrrt_jax.scene.exact_slots import (
     ALL_BITS,
@@ -27,8 +30,9 @@ from vrrt_jax.scene.world import World, obstacle_list
 
 _GEOMETRIES = ("auto", "meshes", "spheres")
 _FRAME_TOLERANCE = 1e-3  # [m] between the body frames of meshes and of spheres at home
-NEAR = 0.05  # [m] farther pairs are no contacts
-_NOTHING = np.zeros(0), np.zeros((0, 2), int)
+_KEPT = 8  # compiled scenes that a thread keeps, the latest ones
+_COMPILING = threading.Lock()  # MuJoCo's compiler is for one thread at a time
+_OWN = threading.local()  # what a thread keeps goes with it
 _INSTALL_ADVICE = "install the version of the meshes that the README names"
 
 
@@ -49,23 +53,29 @@ class _Compiled:
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class ExactScene:
-    """A robot and obstacles in C MuJoCo; for the thread that asked for it."""
+    """A robot and obstacles in C MuJoCo; every thread that asks works on a copy of its own."""
 
-    compiled: _Compiled
+    key: "_Key"
     obstacles: tuple[Obstacle, ...]  # (K,)
     obstacle_geoms: np.ndarray  # (K,) int
     attached: tuple[HeldObject, ...]  # what the robot holds
     allowed: np.ndarray  # (nbody, nbody) how deep bodies may be in each other [m]
 
     @property
+    def compiled(self) -> _Compiled:
+        """This thread's copy."""
+        return _compiled(self.key)
+
+    @property
     def model(self) -> mujoco.MjModel:
         """The model, with this scene's obstacles in place."""
-        if self.compiled.holder is not self:
-            place_obstacles(self.compiled.model, self.compiled.slots, self.obstacles)
-            for body, held in zip(self.compiled.held_bodies, self.attached, strict=True):
-                place(self.compiled.model, self.compiled.model.body_geomadr[body], held.obstacle)
-            self.compiled.holder = self
-        return self.compiled.model
+        own = self.compiled
+        if own.holder is not self:
+            place_obstacles(own.model, own.slots, self.obstacles)
+            for body, held in zip(own.held_bodies, self.attached, strict=True):
+                place(own.model, own.model.body_geomadr[body], held.obstacle)
+            own.holder = self
+        return own.model
 
     @property
     def data(self) -> mujoco.MjData:
@@ -93,36 +103,26 @@ class ExactScene:
         # What is held has other places and sizes than where it was compiled; obstacles stand still.
         return lever_arms(self.model) if self.attached else self.compiled.lever_arms
 
-    def near(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distances (c,) [m] and pairs of bodies (c, 2) that are nearer than :data:`NEAR`.
+    def near(self, q: np.ndarray) -> Near:
+        """Distances (c,) [m] and pairs of bodies (c, 2) nearer than ``advance.NEAR``.
 
         Args:
             q: (D,); negative distances are penetrations. How deep an object may be in its support
                 is no penetration.
         """
-        distance, bodies = self._contacts(q)
+        distance, bodies = near_pairs(self.model, self.data, q)
         if self.attached:
             distance = distance + self.allowed[bodies[:, 0], bodies[:, 1]]
         return distance, bodies
 
-    def _contacts(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        model, data = self.model, self.data
-        data.qpos[:] = q
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_collision(model, data)
-        if data.ncon == 0:
-            return _NOTHING
-        contact = data.contact
-        return contact.dist, model.geom_bodyid[contact.geom]
-
     def depths(self, name: str, q: np.ndarray) -> dict[str, float]:
         """How deep a held object is in obstacles at ``q`` (D,), by their names [m].
 
-        Negative where it is beside them; without those that are farther than :data:`NEAR`.
+        Negative where it is beside them; without those that are not near.
         """
         index = [held.obstacle.name for held in self.attached].index(name)
         own, found = self.compiled.held_bodies[index], {}
-        for distance, pair in zip(*self._contacts(q), strict=True):
+        for distance, pair in zip(*near_pairs(self.model, self.data, q), strict=True):
             first, second = sorted(int(body) for body in pair)
             if first == own and second >= self.num_bodies:
                 other = self._name(second)
@@ -134,21 +134,6 @@ class ExactScene:
         distance, bodies = self.near(q)
         pairs = np.sort(bodies[distance < 0], axis=1)
         return sorted({(int(first), int(second)) for first, second in pairs})
-
-    def speeds(self, turn: np.ndarray) -> np.ndarray:
-        """How fast bodies approach each other at most, (nbody, nbody) [m], on a turn (D,)."""
-        return np.tensordot(np.abs(turn), self.lever_arms, 1) + 1e-9
-
-    def free_span(self, near: tuple[np.ndarray, np.ndarray], speeds: np.ndarray) -> float:
-        """The share of a turn after which something may touch first.
-
-        Args:
-            near: from :meth:`near`, nothing penetrating.
-            speeds: (nbody, nbody) from :meth:`speeds`.
-        """
-        distance, bodies = near
-        far = NEAR / speeds.max()  # what is not near is at least so far away
-        return float((distance / speeds[bodies[:, 0], bodies[:, 1]]).min(initial=far))
 
     def clearance(self, best: float) -> float:
         """Distance [m] of moving geoms to obstacles, at the latest argument of :meth:`touching`.
@@ -223,8 +208,8 @@ def exact_scene(
     for obstacle in obstacles:
         check_obstacle(obstacle)
     room = room_for(obstacles)
-    held = tuple((held.body, held.obstacle.kind) for held in attached)
-    compiled = _build(robot, room, geometry, threading.get_ident(), held)
+    key = robot, room, geometry, tuple((held.body, held.obstacle.kind) for held in attached)
+    compiled = _compiled(key)
     taken = dict.fromkeys(compiled.slots, 0)
     geoms = []
     for obstacle in obstacles:
@@ -234,7 +219,7 @@ def exact_scene(
     bodies = compiled.model.geom_bodyid[geoms]
     body_of = {obstacle.name: body for obstacle, body in zip(obstacles, bodies, strict=True)}
     return ExactScene(
-        compiled=compiled,
+        key=key,
         obstacles=obstacles,
         obstacle_geoms=geoms,
         attached=tuple(attached),
@@ -252,18 +237,38 @@ def _hashable(obstacle: Obstacle) -> Obstacle:
     )
 
 
-@functools.lru_cache(maxsize=16)
+# A robot, room for obstacles, a geometry, and bodies with the kinds of what each of them holds.
+_Key = tuple[Robot, tuple[tuple[str, int], ...], str, tuple[tuple[str, str], ...]]
+
+
+def forget() -> None:
+    """Drop the compiled scenes that this thread keeps, and what new ones are copied from."""
+    _build.cache_clear()
+    vars(_OWN).clear()
+
+
+def _compiled(key: _Key) -> _Compiled:
+    """This thread's scene: MuJoCo's data is for one thread, and so are obstacles in the model."""
+    kept: OrderedDict[_Key, _Compiled] = vars(_OWN).setdefault("kept", OrderedDict())
+    if key not in kept:
+        with _COMPILING:
+            shared = _build(*key)
+            model = copy.copy(shared.model)
+        kept[key] = dataclasses.replace(shared, model=model, data=mujoco.MjData(model))
+        if len(kept) > _KEPT:
+            kept.popitem(last=False)
+    kept.move_to_end(key)
+    return kept[key]
+
+
+@functools.lru_cache(maxsize=_KEPT)
 def _build(
     robot: Robot,
     room: tuple[tuple[str, int], ...],
     geometry: str,
-    thread: int,
     held: tuple[tuple[str, str], ...],
 ) -> _Compiled:
-    """The robot with room for obstacles; every thread has its own, as MuJoCo's data demands.
-
-    ``held`` are bodies and the kinds of what each of them holds.
-    """
+    """The robot with room for obstacles, which threads copy."""
     spec = None if geometry == "spheres" else mesh_spec(robot, visuals=False)
     if spec is None and geometry == "meshes":
         raise ValueError(

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from vrrt_jax.robots import mjcf_writer
+from vrrt_jax.robots.names import free_name
 from vrrt_jax.scene.exact_slots import ALL_BITS
 from vrrt_jax.scene.held import HeldObject
 from vrrt_jax.scene.obstacle_kinds import KINDS
@@ -79,10 +80,10 @@ def _geoms_before(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> Iterator[mujoco.
     before = _moved(spec, body).parent
     if before is None or _moved(spec, before) == spec.worldbody:
         return
-    root = _moved(spec, before)
+    root, names = _moved(spec, before), {geom.name for geom in spec.geoms}
     for k, geom in enumerate(spec.geoms):
         if _moved(spec, geom.parent) == root:
-            geom.name = geom.name or f"geom: {k}"
+            geom.name = geom.name or free_name(f"geom: {k}", names)
             yield geom
 
 

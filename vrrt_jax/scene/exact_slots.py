@@ -97,12 +97,11 @@ def lever_arms(model: mujoco.MjModel) -> np.ndarray:
     """
     # The farthest point of a body's geoms from the body's frame.
     extent = np.zeros(model.nbody)
-    for geom in range(model.ngeom):
+    for geom in np.flatnonzero(model.body_weldid[model.geom_bodyid] != 0):
         body = model.geom_bodyid[geom]
         center, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
         reach = np.linalg.norm(model.geom_pos[geom]) + np.linalg.norm(center)
         extent[body] = max(extent[body], reach + np.linalg.norm(half))
-    extent[model.body_weldid == 0] = 0.0
     arms = np.zeros((model.nq, model.nbody))
     for body in range(1, model.nbody):
         # From the body towards the base: the length of the way so far.

@@ -3,15 +3,21 @@
 import dataclasses
 import functools
 import itertools
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import mujoco
 import numpy as np
 
-from vrrt_jax.robots.sphere_cover import cover_geom
+from vrrt_jax.robots.bounded_cover import cover_within
+from vrrt_jax.robots.convex_parts import piece_of
+from vrrt_jax.robots.geom_pieces import primitive_points
+from vrrt_jax.robots.sphere_cover import MAX_BULGE, cover_geom
+from vrrt_jax.scene.obstacle_kinds import KINDS
 
 MOST_SPHERES = 24  # around one object
 BULGE = 0.01  # [m] what they may stick out, where so many spheres are enough
+_MOST_OF_LARGE = 1000  # around an object that would stick out too far otherwise
 _MOST_SECTORS = 8  # of the ends of a cylinder
 _RIM = 12  # corners of the prism around a cylinder, 3.5 % wider
 _NUM_RADII = 40  # tried for the centers of such sectors
@@ -31,7 +37,8 @@ def cover(kind: str, size: tuple[float, float, float]) -> Cover:
     """Spheres around a primitive: a row for a capsule, bricks of a box, slices of a cylinder.
 
     The fewest are taken that stick out by :data:`BULGE`. Where :data:`MOST_SPHERES` are not enough
-    for that, those are taken that stick out least.
+    for that, those are taken that stick out least, but where that is more than
+    :data:`vrrt_jax.robots.sphere_cover.MAX_BULGE`, there are as many spheres as it takes.
 
     Args:
         kind: sphere, capsule, box or cylinder.
@@ -46,7 +53,22 @@ def cover(kind: str, size: tuple[float, float, float]) -> Cover:
     fine = [choice for choice in choices if choice.bulge <= BULGE + 1e-9]
     if fine:
         return min(fine, key=lambda choice: (len(choice.radius), choice.bulge))
-    return min(choices, key=lambda choice: choice.bulge)
+    least = min(choices, key=lambda choice: choice.bulge)
+    if least.bulge <= MAX_BULGE:
+        return least
+    points = primitive_points(KINDS[kind].geom, np.asarray(size))
+    assert points is not None  # as obstacles are primitives
+    rng = np.random.default_rng(0)
+    found = cover_within([piece_of(*points)], MAX_BULGE, rng, most=_MOST_OF_LARGE)
+    if found is None:
+        warnings.warn(
+            f"a {kind} of size {size} is too large to be held with care: spheres around it stick "
+            f"out by up to {least.bulge:.2f} m, and the planner refuses what is nearer; hold "
+            "several smaller objects in its stead",
+            stacklevel=3,
+        )
+        return least
+    return Cover(center=found[0], radius=found[1], bulge=MAX_BULGE)
 
 
 def corners(kind: str, size: Sequence[float]) -> tuple[np.ndarray, float]:

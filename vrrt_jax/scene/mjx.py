@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from vrrt_jax.core.check_protocols import overrides_is_free
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import TraceIgnoredNames, pytree, static
 from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.kinematics import link_poses, place
@@ -67,6 +68,7 @@ class MjxWorld(World):
     geoms: MjxObstacles
     spheres: WorldSpheres
 
+    @single_precision
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.is_free`."""
         return self._answer(q)[0] & self._held_are_free(q)
@@ -89,6 +91,7 @@ class MjxWorld(World):
         span = self.spheres.free_span(self.obstacles, self.margin, (first, second), edge)
         return jnp.where(is_free, jnp.maximum(span, 0.0), -1.0)
 
+    @single_precision
     def obstacle_clearance(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.obstacle_clearance`; in closed form, as MJX has none."""
         return self.spheres.smallest_clearance(self.obstacles, link_poses(self.chain, q))
@@ -260,7 +263,8 @@ def _answers(scene: MjxScene, others: Any, q: jax.Array) -> tuple[jax.Array, ...
     size = -(-len(q) // num_blocks)
     padded = jnp.pad(q, ((0, num_blocks * size - len(q)), (0, 0)))
     parts = jax.lax.map(block, padded.reshape(num_blocks, size, -1))
-    return tuple(part.reshape(-1, *part.shape[2:])[: len(q)] for part in parts)
+    total = num_blocks * size  # robots without self-collision spheres have no place for "-1"
+    return tuple(part.reshape(total, *part.shape[2:])[: len(q)] for part in parts)
 
 
 @functools.lru_cache(maxsize=64)

@@ -5,6 +5,7 @@ slot holds any kind; :mod:`vrrt_jax.scene.obstacle_kinds` has the table of kinds
 """
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import mujoco
 import numpy as np
 
 from vrrt_jax.core.types import pytree
+from vrrt_jax.robots.names import free_name
 from vrrt_jax.scene.obstacle_kinds import KINDS, SlotShape
 
 PARKED = 1e3  # [m] where the empty slots are
@@ -65,7 +67,8 @@ def signed_distances(obstacles: Obstacles, points: jax.Array) -> jax.Array:
 def load_obstacles(path: str | Path) -> list[Obstacle]:
     """Read the obstacles of an MJCF file: the geoms fixed to its world.
 
-    Spheres, boxes, capsules, cylinders and planes are supported.
+    Spheres, boxes, capsules, cylinders and planes are supported. Geoms without contype and
+    conaffinity are for the eye, and no obstacles. A geom without a name gets one that no other has.
 
     Raises:
         FileNotFoundError: no such file.
@@ -85,13 +88,21 @@ def load_obstacles(path: str | Path) -> list[Obstacle]:
         )
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    if model.ngeom and not collides.any():
+        warnings.warn(
+            f"no geom of '{path}' is an obstacle, as all have contype=0 and conaffinity=0: they "
+            "are for the eye; give contype=1 to those that should be kept free",
+            stacklevel=2,
+        )
+    names = {model.geom(g).name for g in range(model.ngeom)}
     obstacles = []
-    for g in range(model.ngeom):
+    for g in np.flatnonzero(collides).tolist():
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, data.geom_xmat[g])
         obstacles.append(
             Obstacle(
-                name=model.geom(g).name or f"geom_{g}",
+                name=model.geom(g).name or free_name(f"geom_{g}", names),
                 kind=mujoco.mjtGeom(model.geom_type[g]).name[len("mjGEOM_") :].lower(),
                 position=floats(data.geom_xpos[g]),
                 quaternion=floats(quaternion),

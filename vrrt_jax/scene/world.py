@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.edges import StraightLineEdges
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import PytreeSubclasses, TraceIgnored, TraceIgnoredNames, pytree, static
 from vrrt_jax.robots.kinematics import Chain
 from vrrt_jax.scene.held import HeldObject
@@ -33,6 +34,7 @@ _NO_ENGINE = (
 ENGINES = ("mjx", "closed_form")
 
 
+FINER = 4  # times as fine are the checks of edges once the exact check has refused a path
 _MARGIN_SHARES = (1.0, 0.5, 0.25, 0.1)  # of the margin that is wanted, the largest that fits
 
 
@@ -87,6 +89,7 @@ class World(PytreeSubclasses, StraightLineEdges):
         return {}
 
 
+@single_precision
 def is_free(world: World, q: jax.Array) -> jax.Array:
     """Whether ``q`` (D,) touches neither an obstacle nor the robot itself, () bool.
 
@@ -96,19 +99,24 @@ def is_free(world: World, q: jax.Array) -> jax.Array:
     return world.is_free(q)
 
 
-batch_is_free = jax.jit(jax.vmap(is_free, (None, 0)))  # of q (n, D), for the host
+# Of q (n, D), for the host.
+batch_is_free = single_precision(jax.jit(jax.vmap(is_free, (None, 0))))
 
 
-batch_clearance = jax.jit(  # of q (n, D), the smallest, for the host
-    lambda world, q: jnp.min(jax.vmap(lambda q: world.obstacle_clearance(q))(q))
-)
+@single_precision
+@jax.jit
+def batch_clearance(world: "World", q: jax.Array) -> jax.Array:
+    """The smallest clearance () of q (n, D), for the host."""
+    return jnp.min(jax.vmap(lambda q: world.obstacle_clearance(q))(q))
 
 
+@single_precision
 def obstacle_clearance(world: World, q: jax.Array) -> jax.Array:
     """Distance () [m] of the collision spheres at ``q`` (D,) to the nearest obstacle."""
     return world.obstacle_clearance(q)
 
 
+@single_precision
 def build_world(
     robot: Any,
     obstacles: Sequence[Obstacle] = (),
@@ -168,6 +176,7 @@ def build_world(
     return with_obstacles(closed_form_world(robot, fields), obstacles)
 
 
+@single_precision
 def with_obstacles(world: World, obstacles: Sequence[Obstacle]) -> World:
     """The same robot among other obstacles.
 
@@ -203,11 +212,13 @@ def with_obstacles(world: World, obstacles: Sequence[Obstacle]) -> World:
     )
 
 
+@single_precision
 def with_margin(world: World, margin: float) -> World:
     """The same world, where the robot keeps ``margin`` [m] farther from obstacles and itself."""
     return world.with_margin(margin)
 
 
+@single_precision
 def keeping_clearance(world: World, q: np.ndarray, margin: float) -> World:
     """The world in which the robot keeps ``margin`` [m], or as much as configurations leave.
 
@@ -224,6 +235,11 @@ def keeping_clearance(world: World, q: np.ndarray, margin: float) -> World:
         if bool(jnp.all(batch_is_free(wary, jnp.asarray(q, jnp.float32)))):
             return wary
     return world
+
+
+def checked_more_finely(world: World) -> World:
+    """The same world, whose edges are checked in finer steps: the exact check refused a path."""
+    return dataclasses.replace(world, resolution=world.resolution / FINER)
 
 
 def obstacle_list(world: World) -> list[Obstacle]:
@@ -245,6 +261,7 @@ def no_such_obstacle(world: World, name: str) -> str:
     return f"{text}, and the robot holds {held_names(world)}" if world.attached else text
 
 
+@single_precision
 def move_obstacle(
     world: World,
     name: str,

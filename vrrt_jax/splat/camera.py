@@ -2,14 +2,22 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.splat.types import Camera
 
+# Of the vertical field of view [degree]. Less is an angle in radians, more a focal length in mm.
+MIN_FOVY_DEG, MAX_FOVY_DEG = 4.0, 150.0
+MAX_ASPECT = 2.0  # ratio of the two focal lengths
+MAX_DISTANCE_M = 100.0  # from the world's origin; farther ones are in mm
 
+
+@single_precision
 def look_at(
     eye: Sequence[float],
     target: Sequence[float],
@@ -33,9 +41,17 @@ def look_at(
         The camera; its principal point is the middle of the image.
 
     Raises:
-        ValueError: the eye is at the target, or the view direction is parallel to ``up``.
+        ValueError: the eye is at the target, the view direction is parallel to ``up``, or a value
+            is not finite, of another length or out of range.
     """
-    eye_, target_, up_ = (np.asarray(v, np.float64) for v in (eye, target, up))
+    eye_, target_ = _vector(eye, 3, "the camera's position"), _vector(target, 3, "its target")
+    up_ = _vector(up, 3, "its direction up")
+    fovy_deg = _number(fovy_deg, "fovy_deg")
+    if not MIN_FOVY_DEG <= fovy_deg <= MAX_FOVY_DEG:
+        raise ValueError(
+            f"fovy_deg is {fovy_deg:g}; expected the vertical field of view in degrees (not in "
+            f"radians), from {MIN_FOVY_DEG:g} to {MAX_FOVY_DEG:g}"
+        )
     forward = target_ - eye_
     # The rows of the rotation are the camera's axes: right, down, forward.
     right = np.cross(forward, up_)
@@ -54,46 +70,126 @@ def look_at(
     return camera_from_matrix(world_to_cam, focal=float(focal), height=height, width=width)
 
 
+@single_precision
 def camera_from_matrix(
     world_to_cam: np.ndarray,
     *,
-    focal: float,
+    focal: float | Sequence[float],
     height: int,
     width: int,
     principal_point: Sequence[float] | None = None,
 ) -> Camera:
-    """Make a camera from its calibration.
+    """Make a camera from its calibration. Images have no distortion: undistort them before.
 
     Args:
         world_to_cam: (4, 4) rigid transform; the camera points along +z, with x right and y down.
-        focal: focal length [px].
+        focal: focal length [px]; or fx, fy.
         height: image height [px].
         width: image width [px].
-        principal_point: x, y [px]; the middle of the image if None.
+        principal_point: x, y [px], from the corner of the image, half a pixel more than OpenCV's
+            cx, cy; the middle of the image if None.
 
     Raises:
-        ValueError: the matrix is not rigid, or a size is not positive.
+        ValueError: the matrix is not rigid, or a value is not finite, of another length or out of
+            range.
     """
-    world_to_cam = np.asarray(world_to_cam, np.float64)
-    rotation = world_to_cam[:3, :3] if world_to_cam.shape == (4, 4) else np.zeros((3, 3))
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+    world_to_cam = _rigid(world_to_cam)
+    height, width = _size(height, "height"), _size(width, "width")
+    is_pair = np.ndim(focal) == 1
+    fx, fy = _vector(focal, 2, "focal") if is_pair else [_number(focal, "focal")] * 2
+    if not (fx > 0 and fy > 0 and 1 / MAX_ASPECT <= fx / fy <= MAX_ASPECT):
         raise ValueError(
-            "world_to_cam is not a rigid (4, 4) transform; its upper left 3 x 3 block must be a "
-            "rotation"
+            f"focal is {focal}; expected a positive number of pixels, or fx, fy that are about the "
+            "same"
         )
-    if not (focal > 0 and height > 0 and width > 0):
-        raise ValueError(f"focal={focal}, height={height}, width={width}; all must be positive")
-    if principal_point is None:
-        principal_point = (width / 2, height / 2)
+    fovy_deg = 2 * np.degrees(np.arctan(0.5 * height / fy))
+    if fovy_deg > MAX_FOVY_DEG:
+        raise ValueError(
+            f"a focal length of {fy:g} px is a field of view of {fovy_deg:.0f} degrees on an image "
+            f"of {height} px; expected at most {MAX_FOVY_DEG:g}: give it in pixels, not in mm"
+        )
+    middle = [width / 2, height / 2]
+    point = _vector(middle if principal_point is None else principal_point, 2, "centre")
+    if principal_point is not None and np.all(np.abs(point) <= 1):
+        raise ValueError(
+            f"the principal point (centre) is {point.tolist()}; expected pixels, about "
+            f"{middle} in the middle of the image"
+        )
     return Camera(
         world_to_cam=jnp.asarray(world_to_cam, jnp.float32),
-        focal=jnp.float32(focal),
-        principal_point=jnp.asarray(principal_point, jnp.float32),
-        height=int(height),
-        width=int(width),
+        focal=jnp.float32(fy),
+        principal_point=jnp.asarray(point, jnp.float32),
+        height=height,
+        width=width,
+        aspect=float(fx / fy),
     )
 
 
+def _rigid(world_to_cam: np.ndarray) -> np.ndarray:
+    """The transform (4, 4) in float64.
+
+    Raises:
+        ValueError: it is not rigid, or its translation can hardly be in meters.
+    """
+    try:
+        matrix = np.asarray(world_to_cam, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError("world_to_cam is not made of numbers; expected 4 rows of 4") from None
+    if matrix.shape != (4, 4):
+        raise ValueError(
+            f"world_to_cam has shape {matrix.shape}; expected a rigid (4, 4) transform, 4 rows of 4"
+        )
+    last_row = [0.0, 0.0, 0.0, 1.0]
+    if not np.allclose(matrix[3], last_row, rtol=0, atol=1e-6):
+        is_transposed = np.allclose(matrix[:, 3], last_row, rtol=0, atol=1e-6)
+        raise ValueError(
+            f"world_to_cam is not a rigid (4, 4) transform: its last row is {matrix[3].tolist()}; "
+            f"expected 0 0 0 1{': transpose the matrix' if is_transposed else ''}"
+        )
+    rotation = matrix[:3, :3]
+    if (
+        not np.all(np.isfinite(matrix))
+        or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+        or np.linalg.det(rotation) < 0
+    ):
+        raise ValueError(
+            "world_to_cam is not a rigid (4, 4) transform; its upper left 3 x 3 block must be a "
+            "rotation, and all of it finite"
+        )
+    distance = np.linalg.norm(matrix[:3, 3])
+    if distance > MAX_DISTANCE_M:
+        raise ValueError(
+            f"the camera is {distance:.0f} m away from the world's origin; expected at most "
+            f"{MAX_DISTANCE_M:g}: give positions in meters, not in mm"
+        )
+    return matrix
+
+
+def _vector(values: Any, length: int, what: str) -> np.ndarray:
+    """Finite numbers (length,) in float64, or a ValueError."""
+    try:
+        vector = np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        vector = np.array(np.nan)
+    if vector.shape != (length,) or not np.all(np.isfinite(vector)):
+        raise ValueError(f"{what} is {values!r}; expected {length} finite numbers")
+    return vector
+
+
+def _number(value: Any, what: str) -> float:
+    """A finite number, or a ValueError."""
+    return float(_vector([value], 1, what)[0])
+
+
+def _size(value: Any, what: str) -> int:
+    """A number of pixels, or a ValueError."""
+    number = _number(value, what)
+    if number < 1 or number != int(number):
+        raise ValueError(f"{what} is {value!r}; expected a whole, positive number of pixels")
+    return int(number)
+
+
+@single_precision
 def orbit(
     *,
     azimuth_deg: float,
@@ -114,8 +210,15 @@ def orbit(
         fovy_deg: vertical field of view [degree].
         height: image height [px].
         width: image width [px].
+
+    Raises:
+        ValueError: as of :func:`look_at`, or the distance is not positive.
     """
-    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    distance = _number(distance, "distance")
+    if distance <= 0:
+        raise ValueError(f"distance is {distance:g}; expected a positive number of meters")
+    azimuth = np.radians(_number(azimuth_deg, "azimuth_deg"))
+    elevation = np.radians(_number(elevation_deg, "elevation_deg"))
     forward = np.array(
         [
             np.cos(elevation) * np.cos(azimuth),
@@ -123,8 +226,20 @@ def orbit(
             np.sin(elevation),
         ]
     )
-    eye = np.asarray(target, np.float64) - distance * forward
+    eye = _vector(target, 3, "its target") - distance * forward
     return look_at(eye.tolist(), target, fovy_deg=fovy_deg, height=height, width=width)
+
+
+def squared(camera: Camera) -> Camera:
+    """The same view with square pixels: of the same height, and less than a pixel narrower."""
+    if camera.aspect == 1:
+        return camera
+    return dataclasses.replace(
+        camera,
+        principal_point=camera.principal_point / jnp.array([camera.aspect, 1.0]),
+        width=int(camera.width / camera.aspect + 1e-6),
+        aspect=1.0,
+    )
 
 
 def shrunk(camera: Camera, factor: int) -> Camera:
@@ -152,6 +267,7 @@ def cut(camera: Camera, corner: np.ndarray, height: int, width: int) -> Camera:
     )
 
 
+@single_precision
 def stack_cameras(cameras: Sequence[Camera]) -> Camera:
     """Stack V cameras of one size into one whose arrays lead with V."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
@@ -173,4 +289,6 @@ def project(camera: Camera, points_world: jax.Array) -> tuple[jax.Array, jax.Arr
     points_cam = points_world @ camera.world_to_cam[:3, :3].T + camera.world_to_cam[:3, 3]
     depth = points_cam[..., 2]
     pixels = camera.focal * points_cam[..., :2] / jnp.maximum(depth, 0.01)[..., None]
+    if camera.aspect != 1:
+        pixels = pixels * jnp.array([camera.aspect, 1.0])
     return pixels + camera.principal_point, depth

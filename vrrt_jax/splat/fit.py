@@ -15,6 +15,7 @@ import jax
 import mujoco
 import numpy as np
 
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots.mesh_sources import mesh_file
 from vrrt_jax.splat.fit_config import FitConfig, LevelConfig
 from vrrt_jax.splat.fit_level import fit_level
@@ -31,6 +32,7 @@ from vrrt_jax.splat.training_images import (
 _Images = tuple[TrainingImages, TrainingImages, np.ndarray]
 
 
+@single_precision
 def fit_self_model(
     robot, spec: mujoco.MjSpec, path: str | Path, *, seed: int, config: FitConfig
 ) -> SelfModel:

@@ -1,77 +1,58 @@
-"""Goal images: read and write files, check arrays, and shrink them for the search."""
+"""Goal images: check them with their cameras and masks, and shrink them for the search."""
 
+import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
-from vrrt_jax.splat.camera import cut, shrunk, stack_cameras
+from vrrt_jax.splat.background import (
+    MAX_BORDER,
+    MAX_COVERED,
+    MIN_COVERED,
+    robot_on_plain_background,
+)
+from vrrt_jax.splat.camera import cut, shrunk, squared, stack_cameras
+from vrrt_jax.splat.pixels import check_brightness, unit_pixels, valid_mask
 from vrrt_jax.splat.types import Camera, GoalImage
 
-BACKGROUND_TOLERANCE = 0.06  # color difference that still counts as background
+MIN_PX = 16  # of an image, on each side
 MIN_OPAQUE = 0.99  # a fourth channel that is nowhere lower is no mask
-MIN_COVERED = 1e-4  # least share of an image that the robot has to cover
-MAX_COVERED = 0.9  # largest share of an image on a plain background that can be robot
 MIN_VALID = 0.75  # share of a shrunk pixel that has to be valid for its mean to stand for it
+MIN_SEEN = 0.1  # share of the robot that masks have to leave
+MIN_AROUND = 0.01  # share of what they leave that has to be background
 
 
-def read_image(path: str | Path) -> np.ndarray:
-    """Read a picture as float32 (H, W, 3) or, with transparency, (H, W, 4), in [0, 1].
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class View:
+    """A checked goal image in full size, with square pixels."""
 
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not a picture, or truncated.
-    """
-    try:
-        with Image.open(path) as picture:
-            has_alpha = "A" in picture.getbands() or "transparency" in picture.info
-            pixels = np.asarray(picture.convert("RGBA" if has_alpha else "RGB"))
-    except FileNotFoundError:
-        raise FileNotFoundError(f"no goal image at '{path}'; make one with: vrrt render") from None
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise ValueError(f"'{path}' is not a readable picture: {error}") from None
-    return pixels.astype(np.float32) / 255.0
+    rgb: np.ndarray  # (H, W, 3) the robot over black, 0 where not valid
+    alpha: np.ndarray  # (H, W) share of the pixel that the robot covers, 0 where not valid
+    valid: np.ndarray  # (H, W) 1 where the pixel is compared, else 0
+    camera: Camera
 
 
-def write_image(path: str | Path, rgb: np.ndarray, alpha: np.ndarray) -> None:
-    """Write a goal image with its alpha as transparency: a PNG (H, W, 4).
-
-    Args:
-        path: of the file.
-        rgb: (H, W, 3) the robot over black, in [0, 1].
-        alpha: (H, W) share of each pixel that the robot covers, in [0, 1].
-    """
-    # Files hold colors that are not multiplied by alpha.
-    straight = rgb / np.maximum(alpha, 1e-3)[..., None]
-    pixels = np.concatenate([np.clip(straight, 0, 1), alpha[..., None]], axis=-1)
-    Image.fromarray(np.round(255 * pixels).astype(np.uint8), "RGBA").save(path)
-
-
-def prepare_goal(
-    images: Sequence[np.ndarray],
+def check_views(
+    images: Sequence[Any],
     cameras: Sequence[Camera],
-    image_px: int,
-    masks: Sequence[np.ndarray | None] | None = None,
-) -> tuple[GoalImage, Camera]:
-    """Check goal images and shrink them, with their cameras, to the size that is searched at.
+    masks: Sequence[Any] | None = None,
+) -> list[View]:
+    """Check goal images, and tell the robot from its background.
 
     Args:
-        images: V arrays (H, W, 3) or (H, W, 4), uint8 or float in [0, 1]. The fourth channel is
+        images: V arrays, see :func:`~vrrt_jax.splat.pixels.unit_pixels`. The fourth channel is
             alpha, the share of a pixel that the robot covers. Without it, or if all of it is
-            opaque, a pixel is taken to be robot where it differs from the border's median color.
+            opaque, see :func:`~vrrt_jax.splat.background.robot_on_plain_background`.
         cameras: V cameras of the images' sizes.
-        image_px: wanted height; the images are reduced by the nearest whole factor.
-        masks: V arrays (H, W) bool, False where a pixel is unknown or occluded; or None for each.
-
-    Returns:
-        The goal (V, h, w, ...), and the V cameras stacked. The goal's ``valid`` is the share of a
-        shrunk pixel that is valid, or 0 where the share is below 3/4.
+        masks: V arrays (H, W), true where a pixel is compared, false where it is unknown or
+            occluded; or None for each.
 
     Raises:
-        ValueError: what is wrong with an image, and what to do.
+        ValueError: what is wrong with an image, a camera or a mask, and what to do.
     """
     if len(images) != len(cameras) or len(images) == 0:
         raise ValueError(
@@ -83,30 +64,64 @@ def prepare_goal(
             f"got {len(masks)} masks for {len(images)} goal images; give a list with one, or None, "
             "for each"
         )
-    views = []
+    views, alphas, valids = [], [], []
     for image, camera, mask in zip(images, cameras, masks, strict=True):
-        rgb, alpha = _check_image(np.asarray(image), camera)
-        valid = np.ones_like(alpha) if mask is None else _check_mask(mask, camera)
-        # The mean of a block is over its valid pixels alone.
-        factor = max(1, round(camera.height / image_px))
-        share = _block_means(valid, factor)
-        known = np.maximum(share, 1e-6)
+        pixels = _check_size(image, camera)
+        height, width = pixels.shape[:2]
+        valid = np.ones((height, width), np.float32)
+        if mask is not None:
+            valid = valid_mask(mask, height, width)
+        rgb, alpha = _robot_of(pixels, valid)
+        alphas.append(alpha.ravel())
+        valids.append(valid.ravel())
+        planes = np.concatenate([rgb, alpha[..., None], np.ones_like(alpha)[..., None]], axis=-1)
+        planes, camera = _square_pixels(planes * valid[..., None], camera)
         views.append(
-            (
-                _block_means(rgb * valid[..., None], factor) / known[..., None],
-                _block_means(alpha * valid, factor) / known,
-                np.where(share >= MIN_VALID, share, 0.0).astype(np.float32),
-                shrunk(camera, factor),
+            View(rgb=planes[..., :3], alpha=planes[..., 3], valid=planes[..., 4], camera=camera)
+        )
+    _check_masks(np.concatenate(alphas), np.concatenate(valids))
+    shapes = {view.alpha.shape for view in views}
+    if len(shapes) > 1:
+        raise ValueError(f"the views have sizes {sorted(shapes)}; make them all one size")
+    return views
+
+
+def shrink_views(views: Sequence[View], image_px: int) -> tuple[GoalImage, Camera]:
+    """Shrink V views to the size that is searched at.
+
+    Args:
+        views: from :func:`check_views`.
+        image_px: wanted height; the images are reduced by the nearest whole factor.
+
+    Returns:
+        The goal (V, h, w, ...), and the V cameras stacked. The goal's ``valid`` is the share of a
+        shrunk pixel that is valid, or 0 where the share is below 3/4.
+    """
+    goals, cameras = [], []
+    for view in views:
+        # The mean of a block is over its valid pixels alone.
+        factor = max(1, round(view.camera.height / image_px))
+        share = _block_means(view.valid, factor)
+        known = np.maximum(share, 1e-6)
+        goals.append(
+            GoalImage(
+                rgb=jnp.asarray(_block_means(view.rgb, factor) / known[..., None]),
+                alpha=jnp.asarray(_block_means(view.alpha, factor) / known),
+                valid=jnp.asarray(np.where(share >= MIN_VALID, share, 0.0).astype(np.float32)),
             )
         )
-    shapes = {view[0].shape for view in views}
-    if len(shapes) > 1:
-        raise ValueError(
-            f"the views have sizes {sorted(s[:2] for s in shapes)}; make them all one size"
-        )
-    rgb, alpha, valid = (jnp.asarray(np.stack([v[i] for v in views])) for i in range(3))
-    goal = GoalImage(rgb=rgb, alpha=alpha, valid=valid)
-    return goal, stack_cameras([view[3] for view in views])
+        cameras.append(shrunk(view.camera, factor))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *goals), stack_cameras(cameras)
+
+
+def prepare_goal(
+    images: Sequence[Any],
+    cameras: Sequence[Camera],
+    image_px: int,
+    masks: Sequence[Any] | None = None,
+) -> tuple[GoalImage, Camera]:
+    """Check goal images and shrink them: :func:`check_views`, then :func:`shrink_views`."""
+    return shrink_views(check_views(images, cameras, masks), image_px)
 
 
 def cut_goal(
@@ -134,76 +149,82 @@ def cut_goal(
     return jax.tree.map(parts, goal), cut(cameras, corner, height, width)
 
 
-def _check_image(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """The robot over black (H, W, 3), and its alpha (H, W)."""
-    image = _check_pixels(image, camera)
-    has_mask = image.shape[2] == 4 and image[..., 3].min() < MIN_OPAQUE
-    alpha = image[..., 3] if has_mask else _alpha_on_plain_background(image)
-    if has_mask and alpha.mean() < MIN_COVERED:
-        raise ValueError(
-            "the goal image's mask (its fourth channel) is empty: no robot to match; check that "
-            "the mask is 1 on the robot"
-        )
-    return image[..., :3] * alpha[..., None], alpha
-
-
-def _check_pixels(image: np.ndarray, camera: Camera) -> np.ndarray:
-    """The image as float32 (H, W, 3) or (H, W, 4) in [0, 1]."""
-    if image.ndim != 3 or image.shape[2] not in (3, 4):
-        raise ValueError(
-            f"the goal image has shape {image.shape}; expected (height, width, 3) for RGB or "
-            "(height, width, 4) with the robot's mask as fourth channel"
-        )
+def _check_size(image: Any, camera: Camera) -> np.ndarray:
+    """The image (H, W, 3) or (H, W, 4), of the camera's size."""
+    image = unit_pixels(image)
     if image.shape[:2] != (camera.height, camera.width):
         raise ValueError(
             f"the goal image is {image.shape[1]}x{image.shape[0]} px but its camera makes "
             f"{camera.width}x{camera.height} px; give the camera of this image, or resize one"
         )
-    if image.dtype == np.uint8:
-        image = image / 255.0
-    image = image.astype(np.float32)
-    if not np.all(np.isfinite(image)):
+    if min(image.shape[:2]) < MIN_PX:
         raise ValueError(
-            f"the goal image has {int(np.sum(~np.isfinite(image)))} values that are NaN or "
-            "infinite; replace them and mask their pixels out"
+            f"the goal image is {image.shape[1]}x{image.shape[0]} px; expected at least {MIN_PX} "
+            "px on a side"
         )
-    if image.min() < -1e-3 or image.max() > 1 + 1e-3:
-        raise ValueError(
-            f"the goal image's values go from {image.min():.3g} to {image.max():.3g}; expected "
-            "floats in [0, 1] or uint8"
-        )
+    check_brightness(image)
     return image
 
 
-def _alpha_on_plain_background(image: np.ndarray) -> np.ndarray:
-    """Alpha (H, W), 1 where the image differs from the median color of its border."""
-    border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
-    apart = np.abs(image - np.median(border, axis=0))[..., :3].max(axis=-1)
-    alpha = (apart > BACKGROUND_TOLERANCE).astype(np.float32)
+def _robot_of(image: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The robot over black (H, W, 3), and its alpha (H, W); checked where ``valid`` (H, W) is 1."""
+    if image.shape[2] == 4 and image[..., 3].min() < MIN_OPAQUE:
+        rgb, alpha = image[..., :3], image[..., 3]
+        _check_alpha(alpha, valid)
+    else:
+        rgb, alpha = robot_on_plain_background(image[..., :3], valid)
+    return rgb * alpha[..., None], alpha
+
+
+def _check_alpha(alpha: np.ndarray, valid: np.ndarray) -> None:
+    """Raise a ValueError for a mask (H, W) of the robot that can hardly be one."""
+    seen = alpha * valid
+    covered = seen.mean()
+    of_border = np.mean([row.mean() for row in (seen[0], seen[-1], seen[:, 0], seen[:, -1])])
     if alpha.mean() < MIN_COVERED:
         raise ValueError(
-            "the goal image is blank: every pixel has the color of the border; give an image that "
-            "shows the robot"
+            "the goal image's mask (its fourth channel) is empty, or nearly: no robot to match; "
+            "check that the mask is 1 on the robot"
         )
-    if alpha.mean() > MAX_COVERED:
+    if covered > MAX_COVERED or of_border > MAX_BORDER:
         raise ValueError(
-            f"{100 * alpha.mean():.0f} % of the goal image differ from the color of its border; "
-            "expected a plain background, or the robot's mask as fourth channel"
+            f"the goal image's mask (its fourth channel) covers {100 * covered:.0f} % of the image "
+            f"and {100 * of_border:.0f} % of its border; expected 1 on the robot and 0 elsewhere: "
+            "is it inverted?"
         )
-    return alpha
 
 
-def _check_mask(mask: np.ndarray, camera: Camera) -> np.ndarray:
-    """The mask (H, W) as 0 and 1."""
-    mask = np.asarray(mask)
-    if mask.shape != (camera.height, camera.width):
+def _check_masks(alpha: np.ndarray, valid: np.ndarray) -> None:
+    """Raise a ValueError if the masks (n,) of all views hide the robot, or all but the robot."""
+    seen = np.sum(valid * alpha)
+    # What is hidden may have any alpha: where most is seen, that says nothing.
+    if not seen or (seen < MIN_SEEN * alpha.sum() and valid.mean() < 0.5):
+        left = f"only {100 * seen / alpha.sum():.1f} %" if seen else "nothing"
         raise ValueError(
-            f"the mask has shape {mask.shape}; expected {(camera.height, camera.width)}, as the "
-            "image"
+            f"the masks leave {left} of the robot; True marks the pixels to compare: are they "
+            "inverted?"
         )
-    if not mask.any():
-        raise ValueError("the mask hides every pixel; True marks the pixels to compare")
-    return mask.astype(bool).astype(np.float32)
+    if valid.sum() - seen < MIN_AROUND * valid.sum():
+        raise ValueError(
+            "the masks leave nothing but the robot, so that nothing says where it ends; True marks "
+            "the pixels to compare, background too: give the robot's own mask as fourth channel of "
+            "the image"
+        )
+
+
+def _square_pixels(planes: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
+    """Planes (H, W, C) on square pixels, and the camera of these."""
+    narrow = squared(camera)
+    if narrow is camera:
+        return planes, camera
+    box = (0, 0, min(narrow.width * camera.aspect, camera.width), camera.height)
+    resized = [
+        Image.fromarray(planes[..., channel]).resize(
+            (narrow.width, narrow.height), Image.Resampling.BILINEAR, box=box
+        )
+        for channel in range(planes.shape[2])
+    ]
+    return np.stack([np.asarray(plane) for plane in resized], axis=-1), narrow
 
 
 def _block_means(image: np.ndarray, factor: int) -> np.ndarray:

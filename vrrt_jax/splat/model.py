@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.files import replacing
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.splat.types import SplatModel
 
 FORMAT = 3
@@ -56,6 +57,7 @@ class SelfModel:
         return fitting[0] if fitting else self.levels[-1]
 
 
+@single_precision
 def save_self_model(model: SelfModel, path: str | Path) -> None:
     """Write a compressed ``.npz``, atomically."""
     path = Path(path)
@@ -87,6 +89,7 @@ def save_self_model(model: SelfModel, path: str | Path) -> None:
         np.savez_compressed(file, **arrays)
 
 
+@single_precision
 def load_self_model(path: str | Path) -> SelfModel:
     """Read a self-model.
 

@@ -196,8 +196,8 @@ def _set_camera(scene: mujoco.MjvScene, camera: Camera, model: mujoco.MjModel) -
         view.frustum_near, view.frustum_far = near, far
         view.frustum_top = near * cy / focal
         view.frustum_bottom = near * (cy - camera.height) / focal
-        view.frustum_center = near * (camera.width / 2 - cx) / focal
-        view.frustum_width = near * camera.width / 2 / focal
+        view.frustum_center = near * (camera.width / 2 - cx) / (focal * camera.aspect)
+        view.frustum_width = near * camera.width / 2 / (focal * camera.aspect)
     for light in scene.lights[: scene.nlight]:
         if light.headlight:
             light.pos, light.dir = eye, rotation[2]

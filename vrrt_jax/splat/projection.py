@@ -36,7 +36,15 @@ def project_splats(
     Returns:
         The splats with C = 5 features: weighted rgb, weight and density. And the depths (G,) [m],
         1 for splats that are not drawn.
+
+    Raises:
+        ValueError: the camera's pixels are not square.
     """
+    if camera.aspect != 1:
+        raise ValueError(
+            f"the camera's focal lengths differ by a factor of {camera.aspect:.4g}; splats are "
+            "drawn with square pixels: draw them with splat.camera.squared(camera)"
+        )
     # Splats take their link's pose by small matrix products. A gather of poses would do the same,
     # but its gradient is a slow scatter.
     link_to_cam = jnp.matmul(camera.world_to_cam, poses, precision="highest")[:, :3]

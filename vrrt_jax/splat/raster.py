@@ -14,6 +14,7 @@ where it is in front, and only as far as it covers.
 import jax
 import jax.numpy as jnp
 
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.splat.compositing import composite_layers
 from vrrt_jax.splat.footprints import sum_footprints
 from vrrt_jax.splat.projection import project_splats
@@ -21,6 +22,7 @@ from vrrt_jax.splat.types import Camera, SplatModel
 from vrrt_jax.splat.windows import ImageLayout, Windows, place_windows
 
 
+@single_precision
 def render(
     model: SplatModel, poses: jax.Array, camera: Camera, windows: Windows | None = None
 ) -> tuple[jax.Array, jax.Array]:

@@ -15,10 +15,13 @@ class Camera:
     """A pinhole camera."""
 
     world_to_cam: jax.Array  # (4, 4) rigid transform
-    focal: jax.Array  # () [px], square pixels
+    focal: jax.Array  # () [px], of the vertical axis
     principal_point: jax.Array  # (2,) x, y [px]; the center of pixel 0 is at 0.5
     height: int = static()  # [px]
     width: int = static()  # [px]
+    # Horizontal focal length over the vertical one. Splats are drawn with square pixels alone,
+    # which goal images get by `splat.images`.
+    aspect: float = static(default=1.0)
 
 
 @pytree

@@ -4,15 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vrrt_jax.core.edges import StraightLineEdges
+from vrrt_jax.core.edges import StraightLineEdges, steps_between
 
 MIN_SEPARATION = 0.3  # [rad] distance at which configurations count as different
-
-
-def steps_between(world: StraightLineEdges, q_from: np.ndarray, q_to: np.ndarray) -> np.ndarray:
-    """Steps (..., D) from configurations to others, the short way round; on the host."""
-    step = q_to - q_from
-    return step - 2 * np.pi * np.round(step / (2 * np.pi)) * np.asarray(world.is_continuous)
 
 
 def distances_to(world: StraightLineEdges, q: np.ndarray, q_other: np.ndarray) -> np.ndarray:

@@ -8,13 +8,14 @@ import numpy as np
 
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core import tree as trees
+from vrrt_jax.core.planners import RRTConnect
 from vrrt_jax.core.result import EARLY_STOPS, PlanResult, Status, with_time_of
-from vrrt_jax.core.search import SearchResult
+from vrrt_jax.core.search import SearchResult, StopReason
 from vrrt_jax.core.timing import timed
 from vrrt_jax.core.types import ExpansionPolicy
 from vrrt_jax.outcome import Chosen, finish, time_left
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.world import World, with_margin
+from vrrt_jax.scene.world import World, checked_more_finely, with_margin
 from vrrt_jax.visual.distinct import distances_to, distinct
 from vrrt_jax.visual.join import Way, connect, join
 from vrrt_jax.visual.lineages import LineageRRT
@@ -66,7 +67,9 @@ def finish_visual(
     """
     search_threshold = float(problem.goal.threshold)
     found, ends = _choose_ends(world, problem, policy, found, q_start, key, config)
+    stopped = found.stopped
 
+    connector = RRTConnect.for_world(world, lanes=config.tree.lanes)
     # Try the ends in turn, until the tree leads to one.
     way, end = None, ends.order[0]
     all_collide = not np.isfinite(ends.cost[end])
@@ -74,24 +77,28 @@ def finish_visual(
         if candidate in ends.paths:
             way = Way(path=ends.paths[candidate], tree_share=1.0)
         else:
-            found, way = join(world, found, ends.q[candidate], key, config)
+            found, way = join(world, connector, found, ends.q[candidate], key, config)
         if way is not None:
             end = candidate
         if way is not None or found.stopped in EARLY_STOPS:
             break
     target, loss = ends.q[end], float(ends.loss[end])
+    if loss > ends.threshold and found.stopped is StopReason.TIME_LIMIT:
+        # The match was missed before the time was up on the way to what is none.
+        found = dataclasses.replace(found, stopped=stopped)
     chosen = _chosen(way, target, loss, ends.threshold)
     result = finish(robot, world, found, chosen, q_start, key, config)
 
-    # A path that the exact check refuses is sought again, farther away from obstacles.
+    # A path that the exact check refuses is sought again, farther away from obstacles, with edges
+    # that are checked more finely.
     for again in range(1, MAX_REPLANS):
         if result.status is not Status.NOT_VERIFIED:
             break
         key = jax.random.fold_in(key, again)
         idle = dataclasses.replace(found, compile_s=0.0, search_s=0.0)
         rest = time_left(config, result.timing["search_s"])
-        farther = with_margin(world, again * MARGIN_STEP)
-        other, way = connect(farther, idle, target, key, rest)
+        farther = checked_more_finely(with_margin(world, again * MARGIN_STEP))
+        other, way = connect(farther, connector, idle, target, key, rest)
         chosen = _chosen(way, target, loss, ends.threshold)
         other = finish(robot, farther, other, chosen, q_start, key, config)
         other = dataclasses.replace(other, expansions=0)  # of the same search
@@ -175,7 +182,7 @@ def _polished_ends(
         q=polished.q,
         loss=polished.loss,
         cost=polished.cost,
-        order=matched or rivals or [0],
+        order=matched or rivals or [int(np.argmin(polished.loss))],  # the last: all collide
         rivals=rivals,
         paths={},
         threshold=threshold,

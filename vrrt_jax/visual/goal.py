@@ -1,6 +1,7 @@
 """Image goals: what users give, and what the planner compares with at one resolution."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +13,7 @@ from vrrt_jax.core.goal import LeastSquaresGoal
 from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import batch_link_poses
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.splat.images import prepare_goal
+from vrrt_jax.splat.images import View, check_views, shrink_views
 from vrrt_jax.splat.loss import goal_loss, weighted_goal, weighted_image
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
@@ -66,9 +67,11 @@ class ImageGoal:
 
     self_model: SelfModel  # how the robot looks
     camera: Camera | Sequence[Camera]  # the view of the image; or V of them
-    # (H, W, 4) RGB and mask, or (H, W, 3) on a plain background; uint8, or float in [0, 1]; or V
+    # (H, W, 4) RGB and mask, or (H, W, 3) on a plain background; uint8, uint16, or float in
+    # [0, 1]; or V
     image: np.ndarray | Sequence[np.ndarray]
-    # (H, W) bool, True for the pixels that are compared, where not all are; or V of them
+    # (H, W) bool, or 0 and 1, or 0 and 255: true for the pixels that are compared, where not all
+    # are; or V of them
     mask: np.ndarray | Sequence[np.ndarray] | None = None
     # A subclass may change the loss. The threshold stays the one that is calibrated for the mean
     # squared error, times the setting match.scale.
@@ -83,6 +86,12 @@ class ImageGoal:
         masks = None if self.mask is None else list(self.mask)
         return list(self.camera), list(self.image), masks
 
+    @functools.cached_property
+    def checked(self) -> list[View]:
+        """The V views in full size; raises a ValueError if one of them makes no sense."""
+        cameras, images, masks = self.views
+        return check_views(images, cameras, masks)
+
     def at(self, robot: Robot, image_px: int, match_scale: float = 1.0) -> ImageObjective:
         """The goal on images of one height.
 
@@ -95,8 +104,7 @@ class ImageGoal:
             ValueError: an image, a camera or a mask makes no sense, or the masks leave nothing of
                 the robot.
         """
-        cameras, images, masks = self.views
-        image, shrunk_cameras = prepare_goal(images, cameras, image_px, masks)
+        image, shrunk_cameras = shrink_views(self.checked, image_px)
         if not jnp.any(image.valid * image.alpha > 0):
             raise ValueError(
                 f"the masks leave nothing of the robot on images of {image.alpha.shape[1]} px; "
@@ -121,8 +129,7 @@ class ImageGoal:
             image_px: height of the whole images that the close-up is cut from [px].
             match_scale: see :meth:`at`.
         """
-        cameras, images, masks = self.views
-        image, shrunk_cameras = prepare_goal(images, cameras, image_px, masks)
+        image, shrunk_cameras = shrink_views(self.checked, image_px)
         if image.alpha.shape[1] < LEAST_HEIGHT * image_px:
             return None
         level = self.self_model.close_up

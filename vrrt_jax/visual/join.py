@@ -33,7 +33,12 @@ class Way:
 
 
 def join(
-    world: World, found: SearchResult, q_goal: np.ndarray, key: jax.Array, config: PlannerConfig
+    world: World,
+    connector: RRTConnect,
+    found: SearchResult,
+    q_goal: np.ndarray,
+    key: jax.Array,
+    config: PlannerConfig,
 ) -> tuple[SearchResult, Way | None]:
     """A way along the tree to a goal, if there is one; the time for it is added to the search's.
 
@@ -42,6 +47,7 @@ def join(
 
     Args:
         world: robot and obstacles.
+        connector: RRT-Connect.
         found: the search, with its tree.
         q_goal: (D,) free.
         key: random key.
@@ -55,7 +61,7 @@ def join(
         found, compile_s=found.compile_s + compile_s, search_s=found.search_s + join_s
     )
     if not is_free:
-        return connect(world, found, q_goal, key, config, tree)
+        return connect(world, connector, found, q_goal, key, config, tree)
     path = np.concatenate([trees.branch_path(tree, int(node)), q_goal[None]])
     return found, Way(path=path, tree_share=1.0)
 
@@ -83,6 +89,7 @@ def cheapest_parent(
 
 def connect(
     world: World,
+    connector: RRTConnect,
     found: SearchResult,
     q_goal: np.ndarray,
     key: jax.Array,
@@ -95,6 +102,7 @@ def connect(
 
     Args:
         world: robot and obstacles.
+        connector: RRT-Connect.
         found: the search.
         q_goal: (D,) free.
         key: random key.
@@ -102,21 +110,20 @@ def connect(
         tree: to go on from; None begins with the start alone.
     """
     goal = ConfigurationGoal(q=jnp.asarray(q_goal))
-    policy = RRTConnect.for_world(world, lanes=config.tree.lanes)
     if tree is None:
         capacity = config.tree.capacity
-        forest = policy.init(world, goal, np.asarray(found.tree.q[:1]), capacity)
+        forest = connector.init(world, goal, np.asarray(found.tree.q[:1]), capacity)
     else:
-        forest = policy.init_from(world, goal, tree, 2 * tree.capacity)
+        forest = connector.init_from(world, goal, tree, 2 * tree.capacity)
     num_old = int(forest.size)
     connection = search(
         world,
         goal,
-        policy,
+        connector,
         forest,
         key=key,
         termination=make_termination(
-            policy.goal_score(goal), max_iterations=config.budget.connect_iterations
+            connector.goal_score(goal), max_iterations=config.budget.connect_iterations
         ),
         time_limit_s=time_left(config, found.search_s).budget.time_limit_s,
         max_capacity=config.tree.max_capacity,
@@ -127,7 +134,7 @@ def connect(
         compile_s=found.compile_s + connection.compile_s,
         search_s=found.search_s + connection.search_s,
     )
-    path, halves = policy.extract_path(connection.tree), policy.halves(connection.tree)
+    path, halves = connector.extract_path(connection.tree), connector.halves(connection.tree)
     if path is None or halves is None:
         return found, None
     return found, _way(world, path, int(np.sum(halves[0] < num_old)))

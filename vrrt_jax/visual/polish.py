@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.config import PolishConfig
-from vrrt_jax.core.edges import difference, enforce_bounds
+from vrrt_jax.core.edges import difference, enforce_bounds, steps_between
 from vrrt_jax.core.parallel import map_on_threads
 from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import link_poses
@@ -27,7 +27,7 @@ from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.images import cut_goal
 from vrrt_jax.splat.lanes import map_lanes
 from vrrt_jax.splat.types import Camera, SplatModel
-from vrrt_jax.visual.distinct import distinct, steps_between
+from vrrt_jax.visual.distinct import distinct
 from vrrt_jax.visual.goal import CloseUp
 
 LINEARIZE_BATCH = 4  # configurations in one call: with their differences, a batch of renders

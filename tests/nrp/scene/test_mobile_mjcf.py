@@ -8,9 +8,9 @@ from nrp_jax.scene import mobile_mjcf
 from vrrt_jax.robots.packaged import robot_path, scenes_dir
 
 # Position in the parent [m], joint axis, lower and upper limit [rad] or [m] (None: turns for ever).
-# The packaged samplers were trained with these numbers.
+# The packaged samplers were trained with these numbers, but for the lowest torso, then 0.1 m.
 ARM = {
-    "torso_lift": ((-0.086875, 0, 0.37743), "z", (0.1, 0.38615)),
+    "torso_lift": ((-0.086875, 0, 0.37743), "z", (0.0, 0.38615)),
     "shoulder_pan": ((0.119525, 0, 0.34858), "z", (-1.6056, 1.6056)),
     "shoulder_lift": ((0.117, 0, 0.06), "y", (-1.221, 1.518)),
     "upperarm_roll": ((0.219, 0, 0), "x", None),

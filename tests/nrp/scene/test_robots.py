@@ -27,7 +27,7 @@ def test_joints(robot):
     assert robot.num_joints == {"snake": 8, "fetch": 11}[robot.name]
     assert np.all(robot.lower < robot.upper)
     if robot.name == "fetch":
-        np.testing.assert_allclose([robot.lower[0], robot.upper[0]], [0.1, 0.38615])
+        np.testing.assert_allclose([robot.lower[0], robot.upper[0]], [0.0, 0.38615])
         assert robot.is_continuous.tolist() == [False, False, True, False] + [
             name in ("upperarm_roll", "forearm_roll", "wrist_roll")
             for name in robot.joint_names[4:]
@@ -94,6 +94,7 @@ def test_cover_contains_the_primitives_at_any_configuration(robot, rng):
 
 def test_only_links_of_one_layer_of_the_snake_are_checked():
     snake = nrp_jax.load_robot("snake")
+    assert snake.planar_boxes is not None
     assert sorted(snake.planar_boxes.pairs) == [(0, 2), (0, 4), (1, 3), (1, 5), (2, 4), (3, 5)]
 
 

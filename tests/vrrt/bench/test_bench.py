@@ -113,6 +113,22 @@ def test_twins_look_alike(near_task, tmp_path, monkeypatch, capsys):
     assert figure.stat().st_size > 10_000
 
 
+@pytest.mark.parametrize("occluded", [False, True])
+def test_one_measure_says_whether_poses_look_the_same(near_task, occluded):
+    """Also where obstacles hide a part of the robot: it is hidden in both images."""
+    scenery = tasks.Scenery(occluded=occluded)
+    model = methods._self_model("panda")
+
+    def alike(q):
+        return pose_ambiguity.looks_the_same("panda", near_task, q, model, scenery, 128)
+
+    assert alike(near_task.q_goal) and not alike(near_task.q_start)
+    images, masks = tasks.goal_images("panda", near_task, scenery)
+    assert tasks.image_psnr("panda", near_task.q_goal, images, scenery, masks) > 50
+    nudged = near_task.q_goal + np.float32(0.002)
+    assert alike(nudged)
+
+
 def _attempt(**changes):
     fields = {
         "path": np.zeros((2, 7)),

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from vrrt_jax.robots import convex_parts
+from vrrt_jax.robots import convex_parts, geom_pieces
 
 
 def test_piece_contains_every_round_geom():
@@ -25,7 +25,7 @@ def test_piece_contains_every_round_geom():
         "ellipsoid": directions * [0.1, 0.2, 0.3],
     }
     for (body, (piece,)), kind in zip(
-        convex_parts.collision_pieces(model).items(), sizes, strict=True
+        geom_pieces.collision_pieces(model).items(), sizes, strict=True
     ):
         depth = piece.depth(surfaces[kind])
         assert depth.min() > -1e-9, kind

@@ -6,7 +6,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from vrrt_jax.robots import convex_parts, load_robot, mesh_sources, robot_fit, sphere_fit
+from vrrt_jax.robots import (
+    convex_parts,
+    geom_pieces,
+    load_robot,
+    mesh_sources,
+    robot_fit,
+    sphere_fit,
+)
 from vrrt_jax.robots.robot_spheres import spheres_of
 from vrrt_jax.scene.sphere_errors import measure_spheres
 
@@ -61,7 +68,7 @@ def uncovered(model, bodies, robot, rng):
     found = spheres_of(mujoco.MjModel.from_xml_string(robot.xml)).collision
     own = mujoco.MjModel.from_xml_string(robot.xml)
     worst = -np.inf
-    for body, shape in convex_parts.collision_pieces(model).items():
+    for body, shape in geom_pieces.collision_pieces(model).items():
         if body not in bodies:
             continue
         mine = found.body == own.body(model.body(body).name).id

@@ -270,7 +270,8 @@ def test_every_kind_of_geom_and_joint(arm, arm_path):
     np.testing.assert_allclose(robot.lower, [np.radians(-100), -np.pi, np.radians(-90), 0])
     np.testing.assert_allclose(robot.home, [0.5, 1.2, 0.2, 0.1])
     assert set(robot.collision_sphere_bodies) == {"upper", "fore", "rod"}
-    assert set(robot.self_collision_sphere_bodies) == {"base", "upper", "fore", "rod"}
+    # the body with two joints touches nothing but its neighbors in the file
+    assert set(robot.self_collision_sphere_bodies) == {"base", "upper", "rod"}
     assert len(robot.self_collision_pairs) > 0
     q = random_q(robot, 20)
     truth = body_positions(mujoco.MjModel.from_xml_path(str(path)), ["upper", "fore", "rod"], q)
@@ -361,7 +362,7 @@ def test_visuals_of_a_urdf_are_drawn(tmp_path):
 def test_coupled_joints_are_fixed_with_a_warning(tmp_path):
     equality = '<equality><joint joint1="roll" joint2="bend"/></equality><keyframe>'
     path = write(tmp_path, ARM.replace("<keyframe>", equality))
-    with pytest.warns(UserWarning, match=r"roll = 0.2, bend = 1.2; pass freeze"):
+    with pytest.warns(UserWarning, match=r"roll = 1.2, bend = 1.2; pass freeze"):
         robot = load_robot(path)
     assert robot.joint_names == ("turn", "reach")
     with warnings.catch_warnings():

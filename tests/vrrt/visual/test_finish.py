@@ -13,6 +13,7 @@ from pictures import HALF_TURNED, Q_GOAL, Q_START, picture
 import vrrt_jax
 from vrrt_jax import ImageGoal, PlannerConfig, VisualRRT
 from vrrt_jax.core import tree as trees
+from vrrt_jax.core.planners import RRTConnect
 from vrrt_jax.core.search import SearchResult, StopReason
 from vrrt_jax.visual import finish
 from vrrt_jax.visual.join import join
@@ -69,10 +70,10 @@ def test_a_way_obeys_an_is_free_of_ones_own(slider):
     found = finished(trees.create(jnp.asarray(ends[:1]), jnp.zeros(1), None, 8))
     few = PlannerConfig().changed({"tree.lanes": 4, "budget.connect_iterations": 5})
     key = jax.random.key(0)
-    assert join(world, found, ends[1], key, few)[1] is not None
+    assert join(world, RRTConnect.for_world(world), found, ends[1], key, few)[1] is not None
     fields = {field.name: getattr(world, field.name) for field in dataclasses.fields(world)}
     zone = NoPassage(**fields)
-    assert join(zone, found, ends[1], key, few)[1] is None
+    assert join(zone, RRTConnect.for_world(zone), found, ends[1], key, few)[1] is None
     with pytest.raises(ValueError, match="the start is refused by NoPassage.is_free"):
         vrrt_jax.plan_to_configuration(slider, zone, [0.0], [0.5], key=jax.random.key(0))
 
@@ -99,7 +100,35 @@ def test_a_match_without_a_way_is_told(slider, monkeypatch):
     polished = Polished(q=q, loss=np.ones(2), cost=np.ones(2))
     result = finish.finish_visual(*args)
     assert result.ok and result.target == q[0]
-    polished = Polished(q=q, loss=np.full(2, 0.5), cost=np.full(2, np.inf))
+    polished = Polished(q=q, loss=np.array([2.0, 0.5]), cost=np.full(2, np.inf))
     result = finish.finish_visual(*args)
-    assert result.status is vrrt_jax.Status.NO_PATH
+    assert result.status is vrrt_jax.Status.NO_PATH and result.target == q[1]
     assert result.advice == "all that was found is in collision: move the obstacles"
+
+
+@pytest.mark.parametrize("time_limit_s", [np.inf, 0.0])
+def test_a_match_is_missed_before_a_way(slider, monkeypatch, time_limit_s):
+    """Also where the time ran out on the way to what matches nothing."""
+    world = vrrt_jax.build_world(slider, [beside(0.1)], engine="closed_form")
+    q = np.array([[0.5]], np.float32)  # behind the obstacle
+    polished = Polished(q=q, loss=np.array([2.0]), cost=np.array([2.0]))
+    monkeypatch.setattr(finish, "polish", lambda *_: polished)
+    found = finished(trees.create(jnp.asarray(q), jnp.ones(1), None, 8))
+    config = PlannerConfig().changed(
+        {"tree.lanes": 4, "tree.capacity": 64, "budget.connect_iterations": 5}
+    )
+    config = config.changed({"budget.time_limit_s": time_limit_s})
+    goal = types.SimpleNamespace(threshold=1.0)
+    problem: Any = types.SimpleNamespace(goal=goal, polishing=goal)
+    start = np.array([-0.5], np.float32)
+    args = (slider, world, problem, VisualRRT(), found, start, jax.random.key(0), config)
+    result = finish.finish_visual(*args)
+    assert result.status is vrrt_jax.Status.NO_MATCH and result.verification is None
+    assert result.loss == 2.0 and "check the camera" in result.advice
+    # If the time ended the search itself, that is what failed first.
+    early = dataclasses.replace(found, stopped=StopReason.TIME_LIMIT)
+    early_problem: Any = types.SimpleNamespace(
+        goal=types.SimpleNamespace(threshold=0.1), polishing=None
+    )
+    result = finish.finish_visual(*args[:2], early_problem, VisualRRT(), early, *args[5:])
+    assert result.status is vrrt_jax.Status.TIME_LIMIT

@@ -25,10 +25,13 @@ def test_residuals_make_the_loss(panda, self_model, camera, image, open_world, r
     assert float(jnp.sum(residual**2)) == pytest.approx(float(loss), rel=1e-4)
 
 
-def test_a_mask_that_hides_the_robot_is_refused(panda, self_model, camera, image):
+def test_a_mask_that_hides_the_robot_is_refused(panda, self_model, camera, image, rng):
     hiding = image[..., 3] == 0
     with pytest.raises(ValueError, match="the masks leave nothing of the robot"):
         ImageGoal(self_model, camera, image, hiding).at(panda, IMAGE_PX)
+    scattered = rng.random(image.shape[:2]) < 0.5  # of each shrunk pixel too little is left
+    with pytest.raises(ValueError, match="the masks leave nothing of the robot on images of 60 px"):
+        ImageGoal(self_model, camera, image, scattered).at(panda, IMAGE_PX)
 
 
 def test_several_views(panda, self_model, camera, image, open_world):

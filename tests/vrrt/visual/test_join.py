@@ -8,6 +8,7 @@ import pytest
 import vrrt_jax
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import free_prefix, num_checks
+from vrrt_jax.core.planners import RRTConnect
 from vrrt_jax.core.search import SearchResult, StopReason, make_termination, search
 from vrrt_jax.core.shortcut import path_length
 from vrrt_jax.visual.join import connect, join
@@ -44,7 +45,7 @@ def test_the_goal_becomes_a_child_of_the_node_it_costs_least_through(wall_world)
     q = np.asarray(tree.q[:size])
     goal = q[-1] + np.float32(0.1) * np.sign(Q_LEFT - q[-1])
     assert bool(wall_world.is_free(jnp.asarray(goal)))
-    after, way = join(wall_world, found, goal, KEY, CONFIG)
+    after, way = join(wall_world, RRTConnect.for_world(wall_world), found, goal, KEY, CONFIG)
     assert way is not None and way.tree_share == 1.0 and after.search_s >= found.search_s
     np.testing.assert_array_equal(way.path[0], Q_LEFT)
     np.testing.assert_array_equal(way.path[-1], goal)
@@ -60,7 +61,7 @@ def test_the_goal_becomes_a_child_of_the_node_it_costs_least_through(wall_world)
 @pytest.mark.parametrize("iterations", [0, 3])
 def test_where_no_edge_is_free_rrt_connect_goes_on_from_the_tree(wall_world, iterations):
     found = grown(wall_world, iterations)
-    _, way = join(wall_world, found, Q_RIGHT, KEY, CONFIG)
+    _, way = join(wall_world, RRTConnect.for_world(wall_world), found, Q_RIGHT, KEY, CONFIG)
     assert way is not None and is_path_free(wall_world, way.path)
     assert 0.0 <= way.tree_share < 1.0
     old = {row.tobytes() for row in np.asarray(found.tree.q[: int(found.tree.size)])}
@@ -79,7 +80,7 @@ def test_rrt_connect_takes_over_what_a_path_leads_to(wall_world):
     cost = tree.cost.at[jnp.array([2, 3, 4])].set(jnp.array([step, 1e3 + step, 2 * step]))
     tree = vrrt_jax.Tree(**{**vars_of(tree), "parent": parent, "cost": cost})
     goal = vrrt_jax.ConfigurationGoal(q=jnp.asarray(Q_RIGHT))
-    forest = vrrt_jax.RRTConnect.for_world(wall_world).init_from(wall_world, goal, tree, 64)
+    forest = RRTConnect.for_world(wall_world).init_from(wall_world, goal, tree, 64)
     assert int(forest.size) == 4
     np.testing.assert_array_equal(forest.q[:4], np.stack([Q_LEFT, Q_RIGHT, q[2], q[4]]))
     assert forest.parent[:4].tolist() == [-1, -1, 0, 2]
@@ -101,5 +102,5 @@ def test_a_goal_behind_walls_has_no_way(slider):
     )
     few = CONFIG.changed({"tree.lanes": 4, "tree.capacity": 64, "budget.connect_iterations": 5})
     goal = np.array([0.5], np.float32)
-    assert join(world, found, goal, KEY, few)[1] is None
-    assert connect(world, found, goal, KEY, few)[1] is None
+    assert join(world, RRTConnect.for_world(world), found, goal, KEY, few)[1] is None
+    assert connect(world, RRTConnect.for_world(world), found, goal, KEY, few)[1] is None

@@ -132,7 +132,7 @@ class RRTConnect:
 
         # The others extend towards samples. Half of the samples are near the two ends: where
         # limits are far apart, few others serve.
-        q_start, q_goal = tree.q[:2]
+        q_start, q_goal = world.normalize(tree.q[:2])
         ends = jnp.stack([q_start, world.end(q_start, world.edge(q_start, q_goal))])
         lower = jnp.maximum(world.lower, jnp.min(ends, axis=0) - self.margin)
         upper = jnp.minimum(world.upper, jnp.max(ends, axis=0) + self.margin)

@@ -1,0 +1,45 @@
+"""All that is computed here is in float32, also where JAX is set to 64 bit."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+import jax
+import jax.numpy as jnp
+
+Inputs = ParamSpec("Inputs")
+Output = TypeVar("Output")
+
+_HALF = {"float64": jnp.float32, "int64": jnp.int32, "uint64": jnp.uint32}
+
+
+def single_precision(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
+    """Run a function as with JAX's default precision, whatever ``jax_enable_x64`` says.
+
+    It may be called inside a user's ``jit`` too. JAX arrays of 64 bit that it is given are rounded.
+    """
+    apply: Any = function
+
+    @functools.wraps(function)
+    def run(*args: Inputs.args, **kwargs: Inputs.kwargs) -> Output:
+        if jax.dtypes.canonicalize_dtype("float64") == "float32":
+            return function(*args, **kwargs)
+        rounded: Any = [_rounded(value) for value in args]
+        named: Any = {name: _rounded(value) for name, value in kwargs.items()}
+        with jax.enable_x64(False):
+            return apply(*rounded, **named)
+
+    return run
+
+
+def _rounded(tree: Any) -> Any:
+    """The same object if there is nothing to round in it."""
+    if not any(_is_wide(leaf) for leaf in jax.tree.leaves(tree)):
+        return tree
+    return jax.tree.map(
+        lambda leaf: leaf.astype(_HALF[str(leaf.dtype)]) if _is_wide(leaf) else leaf, tree
+    )
+
+
+def _is_wide(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array) and str(leaf.dtype) in _HALF

@@ -1,0 +1,139 @@
+"""What MuJoCo does not do with a URDF file: find its meshes, and mind what its limits say."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import unquote
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+
+_PACKAGES = ("package://", "model://", "$(find ")  # before the name of a package
+_FILE = "file://"
+_READ = (".stl", ".obj", ".msh")  # endings of the meshes that MuJoCo reads
+_LIMITED = ("revolute", "prismatic")
+_NAMES = {"lower", "upper"}
+_MOST_PARENTS = 6  # folders above the file that meshes are looked for in
+
+
+def urdf_root(path: Path) -> ElementTree.Element | None:
+    """The root of a URDF file; None for a file of another kind."""
+    try:
+        root = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError:
+        return None
+    return root if root.tag == "robot" else None
+
+
+def urdf_spec(root: ElementTree.Element, path: Path, *, visuals: bool) -> mujoco.MjSpec:
+    """Read a URDF whose meshes may have URLs.
+
+    Args:
+        root: from :func:`urdf_root`; the names of its meshes become paths.
+        path: of the file.
+        visuals: keep what is for the eye.
+
+    Raises:
+        ValueError: MuJoCo cannot read it, or a mesh that is used is nowhere.
+    """
+    compiler = root
+    for tag in ("mujoco", "compiler"):
+        found = compiler.find(tag)
+        compiler = ElementTree.SubElement(compiler, tag) if found is None else found
+    for joint in root.findall("joint"):
+        limit = joint.find("limit")
+        if limit is not None and joint.get("type") in _LIMITED and _NAMES & set(limit.keys()):
+            for name in sorted(_NAMES):
+                limit.set(name, limit.get(name, "0"))  # MuJoCo takes one alone for none at all
+    compiler.set("discardvisual", "false" if visuals else "true")
+    folder = path.resolve().parent
+    for link, kind, mesh in _meshes(root):
+        if kind == "visual" and not visuals:
+            continue
+        name = mesh.get("filename", "")
+        places = list(_places(name, folder, compiler.get("meshdir", "")))
+        there = next((place for place in places if place.is_file()), None)
+        if there is None:
+            raise ValueError(_not_found(name, link, places))
+        if there.suffix.lower() not in _READ:
+            raise ValueError(
+                f"mesh '{name}' of link '{link}' is a {there.suffix} file; expected one of "
+                f"{', '.join(_READ)}: convert it, and write the new name into the URDF"
+            )
+        mesh.set("filename", str(there.resolve()))
+    compiler.attrib.pop("meshdir", None)
+    compiler.set("strippath", "false")
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+    spec.modelfiledir = str(folder)
+    return spec
+
+
+def _meshes(root: ElementTree.Element) -> Iterator[tuple[str, str, ElementTree.Element]]:
+    """The meshes of a URDF, with the names of their links, and "collision" or "visual"."""
+    for link in root.findall("link"):
+        for kind in ("collision", "visual"):
+            for mesh in link.findall(f"{kind}/geometry/mesh"):
+                yield link.get("name", ""), kind, mesh
+
+
+def _places(name: str, folder: Path, meshdir: str) -> Iterator[Path]:
+    """Where a mesh may be, the likeliest place first."""
+    name = name.strip().replace("\\", "/")
+    if name.startswith(_FILE):
+        name = unquote(name.removeprefix(_FILE)).removeprefix("localhost")
+    parents = [folder, *folder.parents[:_MOST_PARENTS]]
+    for scheme in _PACKAGES:
+        if name.startswith(scheme):
+            rest = name.removeprefix(scheme).replace(")", "", 1 if scheme[0] == "$" else 0)
+            yield from (parent / rest for parent in parents)
+            # The folder of the package may have been renamed, or be the one of the file.
+            yield from (parent / rest.partition("/")[2] for parent in parents)
+            return
+    if meshdir:
+        yield folder / meshdir / name
+        yield folder / meshdir / Path(name).name
+    yield from (parent / name for parent in parents)
+
+
+def _not_found(name: str, link: str, places: list[Path]) -> str:
+    looked = ", ".join(dict.fromkeys(str(place) for place in places[:3]))
+    return (
+        f"mesh '{name}' of link '{link}' was not found; looked for it at {looked} and in the "
+        "folders above: copy it there, or write its path into the URDF, relative to the URDF as in "
+        '"../meshes/arm.stl", or absolute as in "file:///home/me/meshes/arm.stl"'
+    )
+
+
+def bad_urdf_limits(root: ElementTree.Element) -> dict[str, str]:
+    """What is wrong with the limits of joints that have some, by name: words that follow it.
+
+    Only a ``continuous`` joint turns for ever. A limit that is left out is 0.
+    """
+    found = {}
+    for joint in root.findall("joint"):
+        kind, limit = joint.get("type", ""), joint.find("limit")
+        if kind not in _LIMITED:
+            continue
+        given = {} if limit is None else limit.attrib
+        texts = given.get("lower"), given.get("upper")
+        if texts == (None, None):
+            found[joint.get("name", "")] = f"is {kind} and has no limits; {_advice(kind)}"
+            continue
+        try:
+            low, high = (float(text or 0.0) for text in texts)
+        except ValueError:
+            low = high = np.nan
+        if not (np.isfinite(low) and np.isfinite(high) and low < high):
+            found[joint.get("name", "")] = (
+                f"is {kind} and has the limits lower={texts[0] or 0}, upper={texts[1] or 0}; "
+                f"{_advice(kind)}"
+            )
+    return found
+
+
+def _advice(kind: str) -> str:
+    other = ' or type="continuous" for one that turns for ever' if kind == "revolute" else ""
+    return (
+        'expected <limit lower="..." upper="..."/> with two numbers, lower below upper: correct '
+        f'it, or write type="fixed"{other}'
+    )
