@@ -39,6 +39,10 @@ def summary(
         "q_goal": np.round(result.q_goal.astype(float), 6).tolist(),
         "target": np.round(result.target.astype(float), 6).tolist(),
         "alternatives": np.round(result.alternatives, 6).tolist(),
+        "joint_uncertainty": None
+        if result.joint_uncertainty is None
+        else np.round(result.joint_uncertainty, 4).tolist(),
+        "tree_share": round(result.tree_share, 4),
         "timing": {name: round(value, 4) for name, value in result.timing.items()},
         "counts": {
             "iterations": result.iterations,

@@ -51,7 +51,7 @@ class PlanResult:
     """What became of a problem. Letters: ``P`` waypoints, ``D`` joints, ``A`` alternatives."""
 
     status: Status
-    advice: str  # what to try next; "" if solved
+    advice: str  # what to try next; "" if there is nothing
     # (P, D) waypoints of the shortened, verified path; of a failure, the best attempt. It starts
     # exactly where it was told, in the same turn of joints without limits. These go on from there,
     # so that waypoints can be interpolated: the path may end whole turns away from a joint goal.
@@ -76,6 +76,9 @@ class PlanResult:
     tree: Tree
     # Smallest distance of the collision spheres to obstacles on the path [m], where it is measured.
     clearance: float = float("nan")
+    # (D,) how far each joint of the target may be off while the image still matches, the others
+    # following [rad] or [m], at most pi; None where nothing tells.
+    joint_uncertainty: np.ndarray | None = None
     # Of the length of ``raw_path``, what ``tree`` and an edge from it led along. RRT-Connect, which
     # goes on from the tree where no such edge is free, found the rest.
     tree_share: float = 1.0

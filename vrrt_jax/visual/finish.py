@@ -26,6 +26,7 @@ from vrrt_jax.visual.problem import VisualProblem
 MAX_GOALS = 3  # matched configurations that are tried before there is no path
 MAX_REPLANS = 3  # paths that the exact check may refuse before it has the last word
 MARGIN_STEP = 0.01  # [m] by which each of them keeps farther away than the one before
+UNTOLD = 0.3  # [rad] or [m] joints that may be off by more are named
 SAME_LOSS = 1.05  # losses within this factor are the same match
 AMBIGUITY_RATIO = 1.1  # and within this factor the image does not tell which it is
 
@@ -41,6 +42,7 @@ class Ends:
     rivals: list[int]  # which of them are worth naming beside the one that is taken
     paths: dict[int, np.ndarray]  # (P, D) by end, where the tree has one
     threshold: float  # loss of a match
+    uncertainty: np.ndarray | None  # (n, D) how far off each joint may be, where that is known
 
 
 def finish_visual(
@@ -109,9 +111,27 @@ def finish_visual(
     if result.status is Status.NO_PATH and all_collide:
         advice = "all that was found is in collision: move the obstacles"
         result = dataclasses.replace(result, advice=advice)
+    uncertainty = None if ends.uncertainty is None else ends.uncertainty[end]
+    if result.ok and uncertainty is not None:
+        result = dataclasses.replace(result, advice=_untold(robot, uncertainty))
     return dataclasses.replace(
-        result, alternatives=ends.q[alike], search_match_threshold=search_threshold
+        result,
+        alternatives=ends.q[alike],
+        joint_uncertainty=uncertainty,
+        search_match_threshold=search_threshold,
     )
+
+
+def _untold(robot: Robot, uncertainty: np.ndarray) -> str:
+    """What to do about joints that the image hardly tells, "" if there are none."""
+    joints = [
+        f"{name} by {off:.2g}"
+        for name, off in zip(robot.joint_names, uncertainty, strict=True)
+        if off > UNTOLD
+    ]
+    if not joints:
+        return ""
+    return f"the image hardly tells all joints (may be off: {', '.join(joints)}): add a view"
 
 
 def _chosen(way: Way | None, target: np.ndarray, loss: float, threshold: float) -> Chosen:
@@ -161,6 +181,7 @@ def _choose_ends(
         rivals=[],
         paths=paths,
         threshold=threshold,
+        uncertainty=None,
     )
 
 
@@ -186,6 +207,7 @@ def _polished_ends(
         rivals=rivals,
         paths={},
         threshold=threshold,
+        uncertainty=polished.uncertainty,
     )
 
 

@@ -34,6 +34,7 @@ LINEARIZE_BATCH = 4  # configurations in one call: with their differences, a bat
 CLOSE_UP_BATCH = 2  # the same at a close-up: few ends are left, and each core takes some
 EVALUATE_BATCH = 32  # configurations whose cost alone is asked for, in one call
 FD_STEP = 2e-4  # [rad] step of the finite differences; longer ones lose the weak directions
+LEAST_TOLD = 1e-3  # of a threshold per rad^2; joints that raise the loss by less are not told
 RIDGE = 1e-7  # keeps joints that no pixel sees where they are
 MAX_STEP = 0.3  # [rad] of one step of a joint
 FEWEST_MOVED = 0.2  # share of its joints that a sample moves, at least, on average
@@ -84,6 +85,7 @@ class Polished:
     q: np.ndarray  # (n, D)
     loss: np.ndarray  # (n,) on the fine image
     cost: np.ndarray  # (n,) with the prior and the close-up, infinite in collision
+    uncertainty: np.ndarray  # (n, D) how far off a joint may be, see :func:`joint_uncertainty`
 
 
 def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Polished:
@@ -122,7 +124,31 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
         ends = _descend_close_up(world, polishing, polishing.close_up, kept)
         kept = _distinct_ends(world, ends, config.kept)
         loss = _linearize(world, fine, kept.q).loss
-    return Polished(q=kept.q, loss=loss, cost=np.where(kept.free, kept.cost, np.inf))
+    informed = kept.matrix - float(fine.prior) * np.eye(q.shape[1])
+    return Polished(
+        q=kept.q,
+        loss=loss,
+        cost=np.where(kept.free, kept.cost, np.inf),
+        uncertainty=joint_uncertainty(informed, polishing.threshold),
+    )
+
+
+def joint_uncertainty(matrix: np.ndarray, threshold: float) -> np.ndarray:
+    """How far each joint may be off before the loss has risen by the threshold of a match.
+
+    The other joints follow as they like best. What no pixel tells is uncertain by half a turn.
+
+    Args:
+        matrix: (n, D, D) of Gauss and Newton, half of the second derivatives of the loss.
+        threshold: loss of a match.
+
+    Returns:
+        (n, D) [rad] or [m], at most pi.
+    """
+    # The least that a parabola rises if one joint moves by 1 is the inverse of this diagonal.
+    joints = matrix.shape[-1]
+    inverse = np.linalg.inv(matrix.astype(np.float64) + LEAST_TOLD * threshold * np.eye(joints))
+    return np.minimum(np.sqrt(threshold * np.einsum("nii->ni", inverse)), np.pi)
 
 
 def _distinct_ends(world: World, model: _GaussNewtonModel, num: int) -> _GaussNewtonModel:

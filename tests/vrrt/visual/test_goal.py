@@ -11,7 +11,7 @@ from vrrt_jax.visual.problem import make_problem
 
 pytestmark = pytest.mark.light_compilation
 
-IMAGE_PX = QUICK.tree.image_px
+IMAGE_PX = 64
 
 
 def test_residuals_make_the_loss(panda, self_model, camera, image, open_world, rng):

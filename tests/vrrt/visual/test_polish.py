@@ -3,11 +3,18 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from pictures import HALF_TURNED, Q_GOAL, Q_START, picture
 
 import vrrt_jax
 from vrrt_jax import ImageGoal, PlannerConfig, PolishConfig
-from vrrt_jax.visual.polish import LINEARIZE_BATCH, _hand_goal, linearize, polish
+from vrrt_jax.visual.polish import (
+    LINEARIZE_BATCH,
+    _hand_goal,
+    joint_uncertainty,
+    linearize,
+    polish,
+)
 from vrrt_jax.visual.problem import make_problem
 
 
@@ -60,3 +67,13 @@ def test_a_close_up_tells_half_a_turn(panda, self_model, camera, open_world):
 
 def _hand_position(panda, q):
     return np.asarray(vrrt_jax.link_poses(panda.chain, jnp.asarray(q)))[-1, :3, 3].tolist()
+
+
+def test_uncertainty_is_how_far_a_joint_goes_before_the_loss_has_risen_by_the_threshold():
+    # Of a parabola in two joints that make up for each other, and a third that no pixel tells.
+    matrix = np.array([[[4.0, 3.8, 0.0], [3.8, 4.0, 0.0], [0.0, 0.0, 0.0]]])
+    off = joint_uncertainty(matrix, threshold=0.01)[0]
+    assert off[2] == np.pi
+    partner = -3.8 / 4.0 * off[0]  # where the second joint follows as it likes best
+    moved = np.array([off[0], partner, 0.0])
+    assert moved @ matrix[0] @ moved == pytest.approx(0.01, rel=1e-3)
