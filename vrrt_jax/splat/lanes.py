@@ -64,6 +64,36 @@ def each_lane(on_cpu: Callable, elsewhere: Callable) -> Callable:
     return one
 
 
+def one_of(is_first: jax.Array, first: Callable, second: Callable, *args: Any) -> Any:
+    """What one of two functions that render returns.
+
+    Only that one is computed, but under ``vmap`` both are: there :func:`jax.lax.cond` would batch
+    what :func:`each_lane` cannot.
+
+    Args:
+        is_first: () bool.
+        first: a function of ``args`` that closes over no arrays.
+        second: another one, whose results have the same shapes.
+        *args: trees of arrays.
+    """
+
+    @custom_vmap
+    def choose(is_first, *args):
+        return lax.cond(is_first, first, second, *args)
+
+    @choose.def_vmap
+    def _both(num, batched, is_first, *args):
+        def both(is_first, *args):
+            pairs = first(*args), second(*args)
+            return jax.tree.map(lambda a, b: jnp.where(is_first, a, b), *pairs)
+
+        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
+        out = jax.vmap(both, axes, axis_size=num)(is_first, *args)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return choose(is_first, *args)
+
+
 def _in_turn(function: Callable, *args: Any) -> Any:
     """Like ``lax.map``, but copies each lane's inputs before they are used.
 

@@ -22,10 +22,11 @@ from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import num_checks
 from vrrt_jax.core.types import Expansion, Goal, Proposals, Tree, pytree, static
 from vrrt_jax.scene.world import World
-from vrrt_jax.splat.lanes import map_lanes
+from vrrt_jax.splat.lanes import map_lanes, one_of
 from vrrt_jax.visual.adam import adam_step, fresh_moments
 
 JUMP_FIRST, JUMP_LAST = 0.8, 0.2  # [rad] standard deviations of a joint that a jump moves
+BESIDE = 1e-3  # [rad] a joint of a child that only repeats its parent with a gradient
 FEWEST_MOVED = 0.2  # share of its joints that a jump moves, at least, on average
 
 
@@ -89,7 +90,7 @@ class LineageRRT:
         """Iterations (3,) at which the stages end; in the last all have had their steps."""
         turns = -(-self.num // self.lanes)  # iterations in which every lineage has had one
         length = [-(-self.samples // self.lanes), self.jumps * turns]
-        length.append(self.young * turns + self.steps - self.young)
+        length.append((1 + self.young) * turns + self.steps - self.young)
         return jnp.cumsum(jnp.stack([jnp.int32(number) for number in length]))
 
     def init(
@@ -160,16 +161,13 @@ class LineageRRT:
         valid = goes_on[lineage] & (jnp.arange(self.lanes) < self.num)
         parent = jnp.where(valid, tip[lineage], 0)
 
-        # Gradients are stored with the nodes, but for those that took no step yet.
-        q = tree.q[parent]
-        grad = jax.lax.cond(
-            jnp.all(node.has_grad[parent] | ~valid),
-            lambda: node.grad[parent],
-            lambda: map_lanes(jax.grad(lambda q: goal.loss(world, q)), q),
-        )
-        adam = jax.tree.map(lambda leaf: leaf[parent], node.adam)
-        alpha = self.alpha * (1.0 - adam.count / self.steps)
-        step, adam = adam_step(world, q, grad, adam, alpha, self.beta1, self.beta2)
+        # An Adam step. Where no gradient is known yet, a child right beside the tip gets one.
+        q, has_grad = tree.q[parent], node.has_grad[parent][:, None]
+        old = jax.tree.map(lambda leaf: leaf[parent], node.adam)
+        alpha = self.alpha * (1.0 - old.count / self.steps)
+        step, adam = adam_step(world, q, node.grad[parent], old, alpha, self.beta1, self.beta2)
+        adam = jax.tree.map(lambda new, leaf: jnp.where(has_grad[:, 0], new.T, leaf.T).T, adam, old)
+        step = jnp.where(has_grad, step, BESIDE * jax.random.normal(key, step.shape))
         return self._proposals(parent, q + step, valid, lineage, adam)
 
     def _in_turn(self, turn: jax.Array) -> jax.Array:
@@ -212,12 +210,11 @@ class LineageRRT:
     ) -> tuple[jax.Array, LineageNode]:
         """Losses (B,) and payloads of the children."""
         lanes: LineageLanes = proposals.aux
-        loss = functools.partial(goal.loss, world)
-        score, grad = jax.lax.cond(
+        score, grad = one_of(
             lanes.descends[0],
-            lambda q: map_lanes(jax.value_and_grad(loss), q),
-            lambda q: (map_lanes(loss, q), jnp.zeros_like(q)),
-            q,
+            _losses_and_gradients,
+            lambda world, goal, q: (_losses(world, goal, q), jnp.zeros_like(q)),
+            *(world, goal, q),
         )
         return score, LineageNode(
             lineage=lanes.lineage,
@@ -248,10 +245,20 @@ class LineageRRT:
         return trees.best_path(tree)
 
 
+def _losses(world: World, goal: Goal, q: jax.Array) -> jax.Array:
+    """Losses (n,) of configurations (n, D)."""
+    return map_lanes(lambda q: goal.loss(world, q), q)
+
+
+def _losses_and_gradients(world: World, goal: Goal, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Losses (n,) of configurations (n, D), and their gradients (n, D)."""
+    return map_lanes(jax.value_and_grad(lambda q: goal.loss(world, q)), q)
+
+
 @functools.partial(jax.jit, static_argnums=3)
 def tree_from_roots(world: World, goal: Goal, q: jax.Array, capacity: int) -> Tree[LineageNode]:
     """Roots ``q`` (R, D), the start first; the worst of scores for those in collision."""
-    score = map_lanes(lambda q: goal.loss(world, q), q)
+    score = _losses(world, goal, q)
     is_free = jax.vmap(world.is_free)(q)
     payload = LineageNode(
         lineage=jnp.full(len(q), -1, jnp.int32),

@@ -44,7 +44,7 @@ def grown(world, iterations, roots=None, **numbers):
 @pytest.fixture(scope="module")
 def run(wall_world):
     policy, trees = grown(wall_world, 20)
-    assert np.asarray(policy.stages).tolist() == [4, 12, 12 + 50 + 35]
+    assert np.asarray(policy.stages).tolist() == [4, 12, 12 + 52 + 35]
     return trees
 
 
@@ -87,13 +87,23 @@ def test_lineages_are_inherited_and_compete_with_no_other(run):
 def test_tips_descend_by_adam_and_their_children_inherit_the_moments(open_world):
     policy, trees = grown(open_world, 20)
     tree = trees[-1]
-    count = np.asarray(tree.payload.adam.count)
-    assert count.max() == 4  # eight iterations, of which half serve a lineage
-    assert int(jnp.sum(tree.payload.exploited)) == int(np.sum(count > 0)) - np.sum(count == 4) + 64
+    size = int(tree.size)
+    count, has_grad = (
+        np.asarray(leaf)[:size] for leaf in (tree.payload.adam.count, tree.payload.has_grad)
+    )
+    # Eight iterations, of which half serve a lineage: first a child with a gradient, then steps.
+    assert np.bincount(count[has_grad]).tolist() == [64] * 4
+    slopes = jax.vmap(jax.grad(Bowl(q=jnp.asarray(Q_GOAL)).loss, argnums=1), (None, 0))(
+        None, tree.q
+    )
+    np.testing.assert_allclose(
+        tree.payload.grad[:size][has_grad], slopes[:size][has_grad], atol=1e-6
+    )
     adam = optax.scale_by_adam(b1=0.9, b2=0.9)
-    for tip in np.flatnonzero(count == 4)[:5]:
-        nodes = lineage(tree, int(tip))[-5:]
+    for tip in np.flatnonzero(count == 3)[:5]:
+        parent, *nodes = lineage(tree, int(tip))[-5:]
         q = jnp.asarray(tree.q[nodes[0]])
+        assert np.linalg.norm(q - tree.q[parent]) < 0.01
         state = adam.init(q)
         for k, node in enumerate(nodes[1:]):
             slope = jax.grad(Bowl(q=jnp.asarray(Q_GOAL)).loss, argnums=1)(None, q)
@@ -101,6 +111,8 @@ def test_tips_descend_by_adam_and_their_children_inherit_the_moments(open_world)
             q = q - 0.06 * (1 - k / 60) * direction
             np.testing.assert_allclose(tree.q[node], q, atol=1e-4)
             np.testing.assert_allclose(tree.payload.adam.mu[node], state.mu, atol=1e-5)
+    exploited = np.asarray(tree.payload.exploited[:size])
+    assert not np.any(exploited[count == 3]) and np.all(exploited[has_grad & (count < 3)])
 
 
 def test_when_the_young_have_had_their_steps_the_best_go_on(open_world):
