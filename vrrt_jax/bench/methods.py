@@ -67,6 +67,8 @@ class Attempt:
     loss: float
     search_s: float  # planning, without compilation
     refused: int = 0  # paths that the exact check refused while planning
+    ambiguous: bool = False  # it said that other poses look the same
+    tree_share: float | None = None  # of its path, what its tree led along
 
 
 def solve(
@@ -135,6 +137,15 @@ def solve(
         "straight_is_blocked": task.straight_is_blocked,
         "success": success,
         "cause": cause,
+        # It said that it had solved the task, and that no other pose looks the same.
+        "false_solved": bool(
+            not right
+            and attempt.matched
+            and valid
+            and not attempt.ambiguous
+            and (attempt.has_path or not collisions)
+        ),
+        "tree_share": attempt.tree_share,
         "mean_error_rad": round(float(error.mean()), 5),
         "max_error_rad": round(float(error.max()), 5),
         "l2_error_rad": round(float(np.linalg.norm(error)), 5),
@@ -178,6 +189,8 @@ def _plan(inputs, key, config: PlannerConfig, masks, guess) -> Attempt:
         loss=result.loss,
         search_s=times["search_s"] + times["shortcut_s"] + times["verify_s"],
         refused=result.refused,
+        ambiguous=len(result.alternatives) > 0,
+        tree_share=round(result.tree_share, 4),
     )
 
 

@@ -180,6 +180,11 @@ def summarize(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
                 "distance_rad": level,
                 "n": len(own),
                 "success": _mean(row["success"] for row in own),
+                "false_solved": _mean(row["false_solved"] for row in own if "false_solved" in row),
+                # Of what is solved, the share whose whole path came out of the search's tree.
+                "from_tree": _mean(
+                    row["tree_share"] == 1 for row in won if row.get("tree_share") is not None
+                ),
                 "median_time_s": _median(row["time_s"] for row in own),
                 "p95_time_s": round(float(np.quantile([row["time_s"] for row in own], 0.95)), 2),
                 "path_length": _mean(row["path_length"] for row in won),
@@ -189,7 +194,7 @@ def summarize(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
                 "mean_error_rad": _mean(row["mean_error_rad"] for row in own),
                 "median_psnr_db": _median(row["psnr_db"] for row in own),
                 "refused_paths": total_refused(own),
-                "straight_is_blocked": _mean(row["straight_is_blocked"] for row in own),
+                "straight_blocked": _mean(row["straight_is_blocked"] for row in own),
                 "causes": {
                     cause: count
                     for cause in CAUSES

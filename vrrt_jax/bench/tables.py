@@ -36,6 +36,8 @@ def to_text(results: dict[str, Any]) -> str:
                     f"{level['distance_rad']:g}",
                     str(level["n"]),
                     _percent(level["success"]),
+                    _percent(level.get("false_solved")),
+                    _percent(level.get("from_tree")),
                     f"{level['median_time_s']:.2f}",
                     f"{level['p95_time_s']:.2f}",
                     "" if level["path_length"] is None else f"{level['path_length']:.2f}",
@@ -50,12 +52,14 @@ def to_text(results: dict[str, Any]) -> str:
             )
         if len(summary["levels"]) > 1:
             average = _percent(summary["average_success"])
-            rows.append([name, "average", "", average, *[""] * 8])
+            rows.append([name, "average", "", average, *[""] * 10])
     heads = (
         "method",
         "level [rad]",
         "n",
         "success [%]",
+        "falsely solved [%]",
+        "of the solved, from the tree [%]",
         "median time [s]",
         "95 % [s]",
         "path [rad]",
@@ -135,7 +139,11 @@ def _unusual(scenery: dict[str, Any]) -> list[str]:
 def _is_paper(results: dict[str, Any]) -> bool:
     config = results["variants"][0]["config"]
     # Older files have flat settings.
-    return (config["seeds"]["num"] if "seeds" in config else config["probes"]) == 0
+    # Older files have other names for what the paper's planner does without.
+    for stage, name in (("lineages", "num"), ("seeds", "num")):
+        if stage in config:
+            return config[stage][name] == 0
+    return config["probes"] == 0
 
 
 def _command(results: dict[str, Any]) -> str:
