@@ -1,9 +1,10 @@
 """The visual search: what an iteration costs, and the packaged problems from start to end."""
 
+import functools
 import resource
+from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.config import Budget, PlannerConfig
@@ -11,12 +12,12 @@ from vrrt_jax.core.edges import free_prefix, joint_error
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.search import make_termination, search
 from vrrt_jax.core.timing import interleaved_ms
-from vrrt_jax.core.types import Expansion
 from vrrt_jax.planner import plan
 from vrrt_jax.problems import Problem, load_problem, problem_names
-from vrrt_jax.visual.policy import VisualRRT
+from vrrt_jax.visual.lineages import LineageRRT
 from vrrt_jax.visual.problem import make_problem
-from vrrt_jax.visual.seeds import seeded_roots
+
+STAGES = ("scatter", "jump", "descend")  # of the search
 
 
 def run(repeats: int = 15, seeds: int = 3, engine: str = "mjx") -> dict:
@@ -29,60 +30,55 @@ def run(repeats: int = 15, seeds: int = 3, engine: str = "mjx") -> dict:
 
 
 def iteration_split(problem: Problem, repeats: int = 15) -> dict:
-    """Times of the parts of one iteration on a grown tree, each jitted by itself [ms]."""
+    """Times of the parts of one iteration in each stage, each jitted by itself [ms]."""
     config = PlannerConfig()
     visual = make_problem(problem.robot, problem.goal, problem.q_start, config)
-    policy, goal = VisualRRT.from_config(config, problem.world), visual.goal
+    policy, goal = LineageRRT.from_config(config, problem.world), visual.goal
     world, key = problem.world, jax.random.key(0)
-    roots = seeded_roots(world, visual.seeds, problem.q_start[None], key)
-    found = search(
-        world,
-        goal,
-        policy,
-        policy.init(world, goal, roots, config.tree.capacity),
-        key=key,
-        termination=make_termination(-1.0, max_iterations=40),
-        time_limit_s=60.0,
-    )
-    tree = found.tree
-    proposals = jax.jit(policy.propose)(world, goal, tree, key)
-    parents = tree.q[proposals.parent]
-    size = tree.size - policy.lanes
-    expansion = Expansion(
-        q=tree.q[size + jnp.arange(policy.lanes)],
-        node_index=(size + jnp.arange(policy.lanes)).astype(jnp.int32),
-        accepted=jnp.ones(policy.lanes, bool),
-        blocked=jnp.zeros(policy.lanes, bool),
-    )
-    # The arrays are arguments, as in the search: a closure would make them constants.
-    parts = {
-        "iteration": (expand, (world, goal, policy, tree, key)),
-        "gradient": (lambda p, *rest: p.evaluate(*rest), (policy, world, goal, parents, proposals)),
-        "propose": (lambda p, *rest: p.propose(*rest), (policy, world, goal, tree, key)),
-        "edges": (
-            lambda w, a, b: free_prefix(w, a, b, policy.edge_steps),
-            (world, parents, proposals.target - parents),
-        ),
-        "rewire": (
-            lambda p, *rest: p.after_insert(*rest),
-            (policy, world, goal, tree, proposals, expansion),
-        ),
-    }
-    compiled = {name: (jax.jit(function), args) for name, (function, args) in parts.items()}
-    times = interleaved_ms(
-        {name: lambda f=f, args=args: f(*args) for name, (f, args) in compiled.items()}, repeats
-    )
+    begins, functions, calls = [0, *np.asarray(policy.stages).tolist()], _parts(policy), {}
+    for stage, begin, end in zip(STAGES, begins[:-1], begins[1:], strict=True):
+        found = search(
+            world,
+            goal,
+            policy,
+            policy.init(world, goal, problem.q_start[None], config.tree.capacity),
+            key=key,
+            termination=make_termination(-1.0, max_iterations=(begin + end) // 2),
+        )
+        tree = found.tree
+        proposals = jax.jit(policy.propose)(world, goal, tree, key)
+        q = tree.q[proposals.parent]
+        # The arrays are arguments, as in the search: a closure would make them constants.
+        arguments = {
+            "iteration": (world, goal, policy, tree, key),
+            "evaluate": (world, goal, policy, q, proposals),
+            "propose": (world, goal, policy, tree, key),
+            "edges": (world, q, proposals.target),
+        }
+        for name, args in arguments.items():
+            calls[f"{stage}_{name}"] = functools.partial(functions[name], *args)
+    times = interleaved_ms(calls, repeats)
     return {
         "lanes": policy.lanes,
         "num_splats": goal.splats.num_splats,
         "image_px": list(goal.image.alpha.shape[1:]),
         "capacity": config.tree.capacity,
-        "tree_nodes": int(tree.size),
         **{f"{name}_ms": round(value, 2) for name, value in times.items()},
-        "iteration_over_gradient": round(times["iteration"] / times["gradient"], 3),
-        "ms_per_iteration_in_search": round(1e3 * found.search_s / max(int(tree.iteration), 1), 2),
-        "compile_s": round(found.compile_s, 2),
+        "iteration_over_gradient": round(times["descend_iteration"] / times["descend_evaluate"], 3),
     }
+
+
+def _parts(policy: LineageRRT) -> dict[str, Callable]:
+    """The parts of an iteration, jitted."""
+    parts: dict[str, Callable] = {
+        "iteration": expand,
+        "evaluate": lambda world, goal, policy, *rest: policy.evaluate(world, goal, *rest),
+        "propose": lambda world, goal, policy, *rest: policy.propose(world, goal, *rest),
+        "edges": lambda world, q, target: free_prefix(
+            world, q, world.steer(q, target, policy.edge_steps), policy.edge_steps
+        ),
+    }
+    return {name: jax.jit(function) for name, function in parts.items()}
 
 
 def _outcome(problem: Problem, seeds: int) -> dict:
