@@ -18,7 +18,7 @@ _MEASURED = (
     _KINDS.mjGEOM_MESH,  # MuJoCo collides with its convex hull
 )
 _HALF = RESOLUTION / 2 * (1 - 1e-3)  # of the inside of a cell [m]
-_THIN = 1e-4  # [m] between the insides of two cells: thinner geoms may be there
+_THIN = 1e-4  # [m] the gap between the insides of two cells, where thinner geoms may be
 _LEVEL = 1 - 1e-6  # least z of a floor's normal: rounded angles tilt it by a millimeter a meter
 
 
@@ -59,6 +59,9 @@ def read_mjcf_map(path: Path, crop: tuple[float, float, float, float] | None) ->
         if _KINDS(model.geom_type[geom]) not in _MEASURED:
             kind = _KINDS(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
             raise ValueError(f"its {_name(model, int(geom))} is of kind {kind}; make it of boxes")
+    # A thin geom between two cells belongs to both.
+    model.geom_size[geoms] = np.maximum(model.geom_size[geoms], _THIN)
+    model.geom_aabb[geoms, 3:] = np.maximum(model.geom_aabb[geoms, 3:], _THIN)
     # Heights are those above the floor.
     is_floor = data.geom_xmat[planes, 8] > _LEVEL
     if is_floor.any():
@@ -91,15 +94,12 @@ def _fill(model, data, probe: int, geoms, first: np.ndarray, occupied: np.ndarra
     data.geom_xmat[probe] = np.eye(3).ravel()
     shape = occupied.shape
     for geom, (lower, upper) in geoms:
-        # A thin geom between two cells belongs to both.
-        near = max(_THIN - model.geom_aabb[geom, 3:].min(), 0.0)
-        lower, upper = (lower - near) / RESOLUTION, (upper + near) / RESOLUTION
-        start = np.clip(np.floor(lower + 1e-6).astype(int) - first, 0, shape)
-        stop = np.clip(np.ceil(upper - 1e-6).astype(int) - first, 0, shape)
+        start = np.clip(np.floor(lower / RESOLUTION + 1e-6).astype(int) - first, 0, shape)
+        stop = np.clip(np.ceil(upper / RESOLUTION - 1e-6).astype(int) - first, 0, shape)
         for index in np.ndindex(*np.maximum(stop - start, 0)):
             cell = start + index
             data.geom_xpos[probe] = (first + cell + 0.5) * RESOLUTION
-            if mujoco.mj_geomDistance(model, data, probe, geom, RESOLUTION, None) <= near:
+            if mujoco.mj_geomDistance(model, data, probe, geom, RESOLUTION, None) <= 0:
                 occupied[tuple(cell)] = True
 
 
