@@ -33,7 +33,7 @@ def room(fetch):
     return grid, nrp_jax.build_world(fetch, grid)
 
 
-@pytest.mark.parametrize("torso", [0.02, 0.05, 0.1, 0.2, 0.386])
+@pytest.mark.parametrize("torso", [0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.386])
 def test_the_pose_that_a_fetch_drives_in_is_free(fetch, room, torso):
     grid, world = room
     q = TUCK.copy()
