@@ -66,8 +66,9 @@ def _plan(arguments: argparse.Namespace) -> int:
     import jax
 
     from nrp_jax.homes.grid import load_map
-    from nrp_jax.planner import KINDS, check_shape, plan
+    from nrp_jax.planner import KINDS, plan
     from nrp_jax.samplers import load_sampler
+    from nrp_jax.scene.configurations import check_shape
     from nrp_jax.scene.robots import load_robot
     from nrp_jax.scene.world import build_world
 
@@ -133,6 +134,6 @@ def _record(robot: str, arguments: argparse.Namespace, result) -> dict:
         "expansions": result.expansions,
         "nodes": int(result.tree.size),
         "timing": {k: round(v, 4) for k, v in result.timing.items()},
-        "path": [[round(float(v), 5) for v in q] for q in result.path],
-        "trajectory": [[round(float(v), 5) for v in q] for q in result.trajectory],
+        "path": [[round(float(v), 7) for v in q] for q in result.path],
+        "trajectory": [[round(float(v), 7) for v in q] for q in result.trajectory],
     }

@@ -13,12 +13,14 @@ from nrp_jax.config import EDGE_STEPS, PlannerConfig
 from nrp_jax.homes.grid import Grid
 from nrp_jax.planners.nrp import NeuralRRT
 from nrp_jax.samplers import check_fits, load_sampler
-from nrp_jax.scene.exact import STEP, ExactScene, verify
-from nrp_jax.scene.nearest import advice, refusal, shifted, working_world
+from nrp_jax.scene.configurations import check_configuration
+from nrp_jax.scene.exact import ExactScene, verify
+from nrp_jax.scene.nearest import shifted, working_world
 from nrp_jax.scene.robots import MobileRobot
-from nrp_jax.scene.world import GridWorld, batch_is_free, build_world
+from nrp_jax.scene.trajectory import trajectory_of, with_waypoints
+from nrp_jax.scene.world import GridWorld, build_world
 from vrrt_jax.core.check_protocols import check_extracted_path, check_policy
-from vrrt_jax.core.edges import nearest_turn, unwrapped
+from vrrt_jax.core.edges import nearest_turn
 from vrrt_jax.core.goal import ConfigurationGoal, starts_at
 from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.planners import RRT, RRTConnect
@@ -27,13 +29,11 @@ from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import STATUS_OF, PlanResult, Status
 from vrrt_jax.core.search import SearchResult, make_termination, no_search, search
 from vrrt_jax.core.settings import check_settings
-from vrrt_jax.core.shortcut import padded
 from vrrt_jax.core.types import ExpansionPolicy
 
 PLANNERS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g")
 KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae"}  # of the samplers that planners need
 ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
-MOST_TURNS = 100  # beyond so many turns float32 is too coarse for angles
 ADVICE = {
     Status.SOLVED: "",
     Status.NO_MATCH: "raise max_expansions",
@@ -92,10 +92,14 @@ def plan(
     config = _config(config, settings)
     planner = _planner(planner, method)
     world = build_world(robot, grid) if world is None else world
-    start = check_configuration(robot, world, q_start, "start")
+    q_start = check_configuration(robot, world, q_start, "start")
     goal = q_goal if isinstance(q_goal, ConfigurationGoal) else ConfigurationGoal(q=q_goal)
-    goal = dataclasses.replace(goal, q=check_configuration(robot, world, goal.q, "goal"))
-    world, corner = working_world(world)
+    q_goal = check_configuration(robot, world, goal.q, "goal")
+    # All that follows is in the planners' own world.
+    world, corner = working_world(world, goal)
+    places = _Places(corner=corner, start=q_start)
+    start, goal_q = (jnp.asarray(shifted(q, -corner), jnp.float32) for q in (q_start, q_goal))
+    goal = dataclasses.replace(goal, q=goal_q)
     policy = _policy(planner, robot, world, sampler, config)
     if config.capacity < policy.lanes + 2:
         raise ValueError(
@@ -107,7 +111,7 @@ def plan(
     if starts_at(goal, world, start):
         found = no_search(policy, tree)
         at_goal = np.asarray(start)[None]
-        return _moved(_finish(scene, world, corner, goal, at_goal, found, key), corner)
+        return _moved(_finish(scene, world, places, goal, at_goal, found, key), places)
     tried, spent, rejected = 0, Counter(), Counter()
     results: list[PlanResult] = []
     with interruptible() as interrupted:
@@ -130,7 +134,7 @@ def plan(
             path = policy.extract_path(found.tree)
             check_extracted_path(policy, path, np.asarray(start))
             raw = np.asarray(start)[None] if path is None else path
-            results.append(_finish(scene, world, corner, goal, raw, found, key))
+            results.append(_finish(scene, world, places, goal, raw, found, key))
             tried += results[-1].expansions
             spent.update(results[-1].timing)
             rejected.update(results[-1].rejected)
@@ -146,15 +150,33 @@ def plan(
         refused=sum(r.refused for r in results),
         rejected=dict(rejected),
     )
-    return _moved(result, corner)
+    return _moved(result, places)
 
 
-def _moved(result: PlanResult, corner: np.ndarray) -> PlanResult:
-    """A result whose places were measured from a corner (2,), in the map."""
-    names = ("path", "trajectory", "raw_path", "target", "alternatives")
-    places = {name: shifted(getattr(result, name), corner) for name in names}
-    tree = dataclasses.replace(result.tree, q=shifted(np.asarray(result.tree.q), corner))
-    return dataclasses.replace(result, tree=tree, **places)
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Places:
+    """The way back from the planners' own world to the map."""
+
+    corner: np.ndarray  # (2,) of the map [m]
+    start: np.ndarray  # (D,) as it was given
+
+    def of(self, q: np.ndarray) -> np.ndarray:
+        """Configurations (..., D) in the map."""
+        return shifted(q, self.corner)
+
+    def of_path(self, path: np.ndarray) -> np.ndarray:
+        """A path (P, D) in the map; it begins exactly where it was told to."""
+        path = self.of(path)
+        path[0] = self.start
+        return path
+
+
+def _moved(result: PlanResult, places: _Places) -> PlanResult:
+    """A result of the planners' own world, in the map."""
+    paths = {n: places.of_path(getattr(result, n)) for n in ("path", "trajectory", "raw_path")}
+    ends = {n: places.of(getattr(result, n)) for n in ("target", "alternatives")}
+    tree = dataclasses.replace(result.tree, q=places.of(np.asarray(result.tree.q)))
+    return dataclasses.replace(result, tree=tree, **paths, **ends)
 
 
 def _planner(planner: str | ExpansionPolicy, method: str | None) -> str | ExpansionPolicy:
@@ -183,95 +205,6 @@ def _config(config: PlannerConfig | None, settings: dict[str, Any]) -> PlannerCo
     config = dataclasses.replace(config, **settings)
     check_settings(config)
     return config
-
-
-def check_shape(robot: MobileRobot, q: Any, what: str) -> np.ndarray:
-    """Numbers as float64 (D,), which places far from a map's origin need.
-
-    Raises:
-        ValueError: they are none, or not one for each joint.
-    """
-    try:
-        q = np.asarray(q, np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"the {what} is {q!r}; expected numbers, one for each joint") from None
-    if q.shape != (robot.num_joints,):
-        names = ", ".join(robot.joint_names)
-        raise ValueError(f"the {what} has shape {q.shape}; expected ({robot.num_joints},): {names}")
-    return q
-
-
-def check_configuration(
-    robot: MobileRobot, world: GridWorld, q: np.ndarray, what: str
-) -> jax.Array:
-    """A configuration (D,) for the device, in the planners' own world, see ``working_world``.
-
-    Raises:
-        ValueError: wrong shape, not finite, outside the limits or not free; the message names the
-            nearest free configuration.
-    """
-    q = check_shape(robot, q, what)
-    if world.lower.shape != (robot.num_joints,):
-        raise ValueError(
-            f"the world is of a robot with {len(world.lower)} joints, and '{robot.name}' has "
-            f"{robot.num_joints}: build the world for it"
-        )
-    inner, corner = working_world(world)
-    local = shifted(q, -corner)
-    lower, upper = (np.asarray(a, np.float64) for a in (inner.lower, inner.upper))
-    is_continuous = np.asarray(inner.is_continuous)
-    outside = (local < lower - 1e-4) | (local > upper + 1e-4)
-    bad = ~np.isfinite(q) | (outside & ~is_continuous)
-    if bad.any():
-        joint = int(np.flatnonzero(bad)[0])
-        place = "the map spans" if joint < 2 else "its limits are"
-        instead = f"; {advice(robot, world, q)}" if np.isfinite(q).all() and joint > 1 else ""
-        raise ValueError(
-            f"the {what}'s {robot.joint_names[joint]} is {q[joint]}; {place} "
-            f"[{shifted(lower, corner)[joint]:.3f}, {shifted(upper, corner)[joint]:.3f}]{instead}"
-        )
-    if turned := [*np.flatnonzero(is_continuous & (np.abs(q) > 2 * np.pi * MOST_TURNS))]:
-        raise ValueError(
-            f"the {what}'s {robot.joint_names[turned[0]]} is {q[turned[0]]:.4g} rad, more than "
-            f"{MOST_TURNS} turns from zero; expected less: take whole turns of 2 pi off"
-        )
-    # Only what rounding has put beyond a limit is put onto it: joints stay in their turn.
-    inside = np.where(is_continuous, local, np.clip(local, lower, upper)).astype(np.float32)
-    if not batch_is_free(inner, inside[None])[0]:
-        raise ValueError(refusal(robot, world, q, what))
-    return jnp.asarray(inside)
-
-
-def trajectory_of(world: GridWorld, path: np.ndarray) -> np.ndarray:
-    """A path (P, D) in steps (T, D) of 0.02 m or rad at most; angles go on where they wrap."""
-    return _trajectory(world, path)[0]
-
-
-def _trajectory(world: GridWorld, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """See :func:`trajectory_of`; and where on it (P,) the waypoints are."""
-    if len(path) < 2:
-        return np.asarray(path), np.arange(len(path))
-    spans = np.asarray(_spans(world, padded(path)))[: len(path) - 1]
-    counts = np.maximum(np.ceil(spans / STEP), 1).astype(int)
-    index = np.repeat(np.arange(len(counts)), counts)
-    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + 1
-    fraction = (within / counts[index]).astype(np.float32)
-    room = 1 << int(len(index) - 1).bit_length()  # few sizes, so few compilations
-    padding = (0, room - len(index))
-    q_a, q_b = (np.pad(path[index + k], [padding, (0, 0)], mode="edge") for k in (0, 1))
-    points = _interpolate(world, q_a, q_b, np.pad(fraction, padding))
-    steps = unwrapped(world, np.concatenate([path[:1], np.asarray(points)[: len(index)]]))
-    return steps, np.concatenate([[0], np.cumsum(counts)])
-
-
-@jax.jit
-def _spans(world: GridWorld, path: jax.Array) -> jax.Array:
-    return world.span(world.edge(path[:-1], path[1:]))
-
-
-@jax.jit
-def _interpolate(world: GridWorld, q_a, q_b, fraction) -> jax.Array:
-    return world.interpolate(q_a, q_b, fraction)
 
 
 def _policy(
@@ -303,7 +236,7 @@ def _policy(
 def _finish(
     scene: ExactScene,
     world: GridWorld,
-    corner: np.ndarray,
+    places: _Places,
     goal: ConfigurationGoal,
     raw: np.ndarray,
     found: SearchResult,
@@ -313,11 +246,11 @@ def _finish(
     loss, threshold = float(goal.loss(world, jnp.asarray(raw[-1]))), float(goal.threshold)
 
     def check(path: np.ndarray) -> CheckedPath:
-        trajectory, waypoints = _trajectory(world, path)
+        trajectory, waypoints = with_waypoints(world, path)
         # Waypoints in the turns that the robot is in by then, so that they can be interpolated.
         path = nearest_turn(world, path, trajectory[waypoints])
-        lower, upper = (shifted(np.asarray(a), corner) for a in (world.lower, world.upper))
-        verification = verify(scene, shifted(trajectory, corner), lower=lower, upper=upper)
+        lower, upper = (places.of(np.asarray(a)) for a in (world.lower, world.upper))
+        verification = verify(scene, places.of_path(trajectory), lower=lower, upper=upper)
         return CheckedPath(path=path, trajectory=trajectory, verification=verification)
 
     if loss <= threshold:

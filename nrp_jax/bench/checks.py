@@ -45,8 +45,9 @@ class SphereLoop:
             np.asarray(getattr(robot.chain, name), float)
             for name in ("constant", "cosine", "sine", "slide")
         ]
-        # Spheres of the arm, which must not touch the floor or the base.
+        # Spheres of the arm, which must not touch the floor, and those of its boxes, nor the base.
         self.is_arm = ~np.isin(self.link, np.arange(robot.base_dim + 2)) & (not robot.planar)
+        self.is_boxed = np.isin(self.link, robot.shapes.box_link if robot.shapes else ())
 
     def is_free(self, q: np.ndarray) -> bool:
         """Whether ``q`` (D,) is free."""
@@ -96,13 +97,13 @@ class SphereLoop:
         return bool(((gap[:, : 2 if flat else 3] ** 2).sum(1) < radius**2).any())
 
     def _base_is_free(self, position: np.ndarray, center: np.ndarray) -> bool:
-        """Whether the round base at a position (3,) touches no cell and no sphere (n, 3)."""
+        """Whether the round base at a position (3,) touches no cell, and no box's sphere (n, 3)."""
         base = self.robot.footprint
         assert base is not None
         radius, height = float(base.radius), float(base.height)
         beside = np.linalg.norm(center[:, :2] - position[:2], axis=1) - radius
         gap = np.hypot(np.maximum(beside, 0), np.maximum(center[:, 2] - height, 0))
-        if (gap[self.is_arm] < self.radius[self.is_arm]).any():
+        if (gap[self.is_boxed] < self.radius[self.is_boxed]).any():
             return False
         return not self._hits(position, radius, top=height)
 
@@ -132,7 +133,7 @@ def planar_boxes_overlap(robot: MobileRobot, poses: np.ndarray) -> bool:
 
 
 def shapes_overlap(robot: MobileRobot, poses: np.ndarray) -> bool:
-    """Whether checked capsules and boxes overlap: the nearest points of each pair by trisection."""
+    """Whether checked shapes overlap, the base with them: nearest points by trisection."""
     shapes = robot.shapes
     if shapes is None:
         return False
@@ -153,11 +154,24 @@ def shapes_overlap(robot: MobileRobot, poses: np.ndarray) -> bool:
         half = np.asarray(shapes.box_half, float)[box]
         return np.linalg.norm(local - np.clip(local, -half, half), axis=1)
 
+    def to_base(point: np.ndarray) -> np.ndarray:
+        base = robot.footprint
+        if base is None:
+            return np.full(len(point), np.inf)
+        beside = np.linalg.norm(point[:, :2] - poses[base.link, :2, 3], axis=1) - base.radius
+        return np.hypot(np.maximum(beside, 0), np.maximum(point[:, 2] - base.height, 0))
+
     first, second = np.array(shapes.pairs).T
     capsule, box = np.array(shapes.box_pairs).T
     apart = _trisect(lambda t: to_segment(start[first] + t[:, None] * axis[first], second), first)
     boxed = _trisect(lambda t: to_box(start[capsule] + t[:, None] * axis[capsule], box), capsule)
-    return bool((apart < radius[first] + radius[second]).any() or (boxed < radius[capsule]).any())
+    arm = np.flatnonzero(np.array(shapes.link) > robot.base_dim + 1)
+    above = _trisect(lambda t: to_base(start[arm] + t[:, None] * axis[arm]), arm)
+    return bool(
+        (apart < radius[first] + radius[second]).any()
+        or (boxed < radius[capsule]).any()
+        or (above < radius[arm]).any()
+    )
 
 
 def _trisect(distance: Callable[[np.ndarray], np.ndarray], pairs: np.ndarray) -> np.ndarray:

@@ -18,13 +18,16 @@ _MEASURED = (
     _KINDS.mjGEOM_MESH,  # MuJoCo collides with its convex hull
 )
 _HALF = RESOLUTION / 2 * (1 - 1e-3)  # of the inside of a cell [m]
+_THIN = 1e-4  # [m] the gap between the insides of two cells, where thinner geoms may be
+_LEVEL = 1 - 1e-6  # least z of a floor's normal: rounded angles tilt it by a millimeter a meter
 
 
 def read_mjcf_map(path: Path, crop: tuple[float, float, float, float] | None) -> Grid:
-    """Cut the geoms of a scene into cells, from the floor at z = 0 up to 2 m.
+    """Cut the geoms of a scene into cells, from the floor up to 2 m above it.
 
-    A cell is solid if its inside touches a geom, or the half space behind a plane. Geoms that
-    collide with nothing (``contype`` and ``conaffinity`` 0) are left out.
+    The floor is the highest level plane that faces up, or z = 0. A cell is solid if its inside
+    touches a geom, or the half space behind another plane. Geoms that collide with nothing
+    (``contype`` and ``conaffinity`` 0) are left out.
 
     Args:
         path: of the scene.
@@ -56,9 +59,16 @@ def read_mjcf_map(path: Path, crop: tuple[float, float, float, float] | None) ->
         if _KINDS(model.geom_type[geom]) not in _MEASURED:
             kind = _KINDS(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
             raise ValueError(f"its {_name(model, int(geom))} is of kind {kind}; make it of boxes")
+    # A thin geom between two cells belongs to both.
+    model.geom_size[geoms] = np.maximum(model.geom_size[geoms], _THIN)
+    model.geom_aabb[geoms, 3:] = np.maximum(model.geom_aabb[geoms, 3:], _THIN)
+    # Heights are those above the floor.
+    is_floor = data.geom_xmat[planes, 8] > _LEVEL
+    if is_floor.any():
+        data.geom_xpos[:, 2] -= data.geom_xpos[planes[is_floor], 2].max()
     # A grid around all of them but for the floor, in cells of 0.1 m.
     boxes = [_bounds(model, data, int(g)) for g in geoms]
-    walls = [int(g) for g in planes if data.geom_xmat[g][8] < 1 - 1e-9]
+    walls = planes[~is_floor].tolist()
     outer = boxes + [_bounds(model, data, g) for g in walls]
     if not outer:
         raise ValueError("the scene has no geom to collide with but floors")
@@ -73,8 +83,8 @@ def read_mjcf_map(path: Path, crop: tuple[float, float, float, float] | None) ->
         raise ValueError(f"nothing of it lies between {low[:2].tolist()} and {high[:2].tolist()}")
     check_memory(30.0 * shape.prod(), f"a map of {shape[0]} x {shape[1]} x {shape[2]} cells")
     occupied = np.zeros(shape, bool)
-    for geom in planes:
-        occupied |= _behind(data, int(geom), first, shape)
+    for geom in walls:
+        occupied |= _behind(data, geom, first, shape)
     _fill(model, data, probe.id, zip(geoms.tolist(), boxes, strict=True), first, occupied)
     return Grid(occupied=occupied, origin=tuple((first * RESOLUTION).tolist()))
 

@@ -177,9 +177,12 @@ def _solid(image: Image.Image, about: _About, box: tuple[int, int, int, int]) ->
         solid[row - top : row - top + strip.height] = part
         is_unknown_free |= bool(free[unknown]) and bool((sums == unknown).any())
     if is_unknown_free and about.mode != "raw":
+        why, what = f"free_thresh is {about.free_below}", "set it to 0.196"
+        if averaged == 4:
+            why, what = "the mean counts the alpha channel too", "save the image without one"
         warnings.warn(
             f"gray {_UNKNOWN} in '{about.image.name}', which map savers write for unknown, is free "
-            f"as free_thresh is {about.free_below}; set it to 0.196 to make unknown solid",
+            f"as {why}; {what} to make unknown solid",
             stacklevel=5,
         )
     return solid

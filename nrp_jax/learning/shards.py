@@ -21,7 +21,7 @@ from nrp_jax.scene.world import build_world
 from vrrt_jax.core.command import end_with_parent
 from vrrt_jax.core.files import replacing
 
-VERSION = 5  # of rows and choice of homes; other versions are refused
+VERSION = 6  # of rows, checks of their edges and choice of homes; other versions are refused
 ROWS = ("q_start", "q_goal", "waypoint", "optimal", "ratio", "length", "query")
 FIRST_TEST_SEED = 1_000_000  # seeds of test homes begin here, those of training homes are below
 

@@ -4,9 +4,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from nrp_jax.scene.field import DistanceField
-from nrp_jax.scene.link_shapes import LinkShapes, gaps
+from nrp_jax.scene.link_shapes import LinkShapes, axes, gaps, segment_to_cylinder
 from nrp_jax.scene.near_cells import NearCells, touches
 from nrp_jax.scene.robots import PlanarBoxes
 from vrrt_jax.core.edges import StraightLineEdges, joint_steps
@@ -17,12 +18,14 @@ from vrrt_jax.robots.kinematics import Chain, link_poses, place
 
 @pytree
 class RoundBase:
-    """A round base among the cells that are low enough to be in its way."""
+    """A round base among the cells that are low enough to be in its way, and below an arm."""
 
     near: NearCells  # planar
     radius: jax.Array  # () [m]
     height: jax.Array  # () [m]
     link: int = static()
+    capsules: tuple[int, ...] = static()  # of the arm, among the shapes
+    spheres: tuple[int, ...] = static()  # that cover the arm's boxes, among the collision spheres
 
 
 @pytree
@@ -76,10 +79,14 @@ class GridWorld(PytreeSubclasses, StraightLineEdges):
         if self.planar_boxes is not None:
             free &= _boxes_apart(self.planar_boxes, poses)
         if self.shapes is not None:
-            free &= jnp.all(jnp.concatenate(gaps(self.shapes, poses)) > 0)
+            start, axis = axes(self.shapes, poses)
+            free &= jnp.all(jnp.concatenate(gaps(self.shapes, poses, start, axis)) > 0)
+            if self.base is not None:
+                radius = self.collision_radius
+                above = _above_base(self.base, self.shapes, poses, start, axis, centers, radius)
+                free &= jnp.all(above > 0)
         if self.base is not None:
             free &= ~jnp.any(touches(self.base.near, stand[:, None], self.base.radius))
-            free &= _base_is_free(self.base, poses, centers, self.collision_radius, self.floor)
         return free
 
     def interpolate(self, q_a: jax.Array, q_b: jax.Array, fraction: jax.Array) -> jax.Array:
@@ -146,13 +153,20 @@ def _boxes_apart(boxes: PlanarBoxes, poses: jax.Array) -> jax.Array:
     return jnp.all(apart)
 
 
-def _base_is_free(
-    base: RoundBase, poses: jax.Array, centers: jax.Array, radius: jax.Array, floor: jax.Array
+def _above_base(
+    base: RoundBase,
+    shapes: LinkShapes,
+    poses: jax.Array,
+    start: jax.Array,
+    axis: jax.Array,
+    centers: jax.Array,
+    radius: jax.Array,
 ) -> jax.Array:
-    """Whether a cylinder touches no sphere that must not touch the floor."""
-    # Gap of each sphere's center to the cylinder, beside it and above it.
-    position = poses[base.link, :3, 3:]
-    beside = jnp.sqrt(jnp.sum((centers[:2] - position[:2]) ** 2, axis=0)) - base.radius
-    above = centers[2] - base.height
-    gap = jnp.maximum(beside, 0.0) ** 2 + jnp.maximum(above, 0.0) ** 2
-    return jnp.all((gap > radius**2) | jnp.isinf(floor))
+    """Gaps (C,) between a round base and the arm: its capsules, and the spheres of its boxes."""
+    capsules, spheres = np.array(base.capsules, int), np.array(base.spheres, int)
+    # Spheres are capsules of no length.
+    first = jnp.concatenate([start[:, capsules], centers[:, spheres]], axis=1)
+    along = jnp.pad(axis[:, capsules], [(0, 0), (0, len(spheres))])
+    thick = jnp.concatenate([shapes.radius[capsules], radius[spheres]])
+    local = first - poses[base.link, :3, 3:] * jnp.array([[1.0], [1.0], [0.0]])
+    return segment_to_cylinder(local, along, base.radius, base.height) - thick

@@ -1,5 +1,6 @@
-"""A robot against itself: the capsules and boxes that its links are made of, exactly."""
+"""A robot against itself: the capsules and boxes of its links, and its round base, exactly."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -11,7 +12,7 @@ from vrrt_jax.core.types import pytree, static
 from vrrt_jax.robots.kinematics import place, placement
 from vrrt_jax.robots.self_collision import checked_pairs
 
-_HALVINGS = 9  # of a capsule's axis, in search of its nearest point to a box
+_HALVINGS = 9  # of a capsule's axis, in search of its nearest point to a convex solid
 
 
 @pytree
@@ -81,10 +82,8 @@ def link_shapes(
     )
 
 
-def gaps(shapes: LinkShapes, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Gaps (P,) between pairs of capsules and (P',) between capsules and boxes [m].
-
-    They are negative where the shapes overlap, and not exact there.
+def axes(shapes: LinkShapes, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Where the capsules' axes start (3, M) and where they lead (3, M) [m].
 
     Args:
         shapes: from :func:`link_shapes`.
@@ -93,7 +92,22 @@ def gaps(shapes: LinkShapes, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
     # The barrier keeps XLA's CPU fusions from placing the ends once for every use.
     ends = jax.lax.optimization_barrier(place(shapes.ends, poses))
     num = len(shapes.link)
-    start, axis = ends[:, :num], ends[:, num:] - ends[:, :num]
+    return ends[:, :num], ends[:, num:] - ends[:, :num]
+
+
+def gaps(
+    shapes: LinkShapes, poses: jax.Array, start: jax.Array, axis: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Gaps (P,) between pairs of capsules and (P',) between capsules and boxes [m].
+
+    They are negative where the shapes overlap, and not exact there.
+
+    Args:
+        shapes: from :func:`link_shapes`.
+        poses: (L, 4, 4) of the links.
+        start: (3, M) and
+        axis: (3, M) from :func:`axes`.
+    """
     first, second = np.array(shapes.pairs, int).reshape(-1, 2).T
     pairs = (start[:, first], axis[:, first], start[:, second], axis[:, second])
     between = _between_segments(*jax.lax.optimization_barrier(pairs))
@@ -128,25 +142,50 @@ def _between_segments(p: jax.Array, u: jax.Array, q: jax.Array, v: jax.Array) ->
 
 
 def _segment_to_box(start: jax.Array, axis: jax.Array, half: jax.Array) -> jax.Array:
-    """Lower bounds (P,) of distances from segments (3, P) to boxes (3, P) around the origin.
+    """Lower bounds (P,) of distances from segments (3, P) to boxes (3, P) around the origin."""
+    return _segment_to(start, axis, lambda point: point - jnp.clip(point, -half, half))
+
+
+def segment_to_cylinder(
+    start: jax.Array, axis: jax.Array, radius: jax.Array, height: jax.Array
+) -> jax.Array:
+    """Lower bounds (P,) of distances from segments (3, P) to a cylinder at the origin.
+
+    The cylinder of a ``radius`` () stands upright and reaches up to a ``height`` (), from below all
+    else.
+    """
+
+    def outside(point: jax.Array) -> jax.Array:
+        beside = jnp.sqrt(_dot(point * jnp.array([[1.0], [1.0], [0.0]]), point))
+        share = jnp.maximum(1 - radius / jnp.maximum(beside, 1e-9), 0)
+        return jnp.stack([point[0] * share, point[1] * share, jnp.maximum(point[2] - height, 0)])
+
+    return _segment_to(start, axis, outside)
+
+
+def _segment_to(
+    start: jax.Array, axis: jax.Array, outside: Callable[[jax.Array], jax.Array]
+) -> jax.Array:
+    """Lower bounds (P,) of distances from segments (3, P) to convex solids.
 
     The distance is convex along a segment, so that its slope tells in which half the nearest point
     is.
-    """
 
-    def outside(t: jax.Array) -> jax.Array:
-        point = start + t * axis
-        return point - jnp.clip(point, -half, half)
+    Args:
+        start: (3, P) and
+        axis: (3, P) of the segments.
+        outside: of points (3, P), the steps (3, P) to them from the nearest points of the solids.
+    """
 
     def halve(_: Any, bounds: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         low, high = bounds
         middle = (low + high) / 2
-        rises = _dot(outside(middle), axis) > 0
+        rises = _dot(outside(start + middle * axis), axis) > 0
         return jnp.where(rises, low, middle), jnp.where(rises, middle, high)
 
     low = jnp.zeros_like(start[0])
     low, high = jax.lax.fori_loop(0, _HALVINGS, halve, (low, low + 1))
-    nearest = outside((low + high) / 2)
+    nearest = outside(start + (low + high) / 2 * axis)
     return jnp.sqrt(_dot(nearest, nearest)) - jnp.sqrt(_dot(axis, axis)) / 2 ** (_HALVINGS + 1)
 
 

@@ -5,11 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax.homes.grid import Grid
+from nrp_jax.scene.car_world import CarWorld
 from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.grid_world import GridWorld
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import batch_is_free, corner_of, from_corner
 from vrrt_jax.core.check_protocols import overrides_is_free
+from vrrt_jax.core.goal import ConfigurationGoal
 
 WITHIN_M, WITHIN_RAD = 0.05, 0.1  # how far a free configuration is looked for, joint by joint
 _BATCH, _ROUNDS = 2048, 8
@@ -17,22 +19,30 @@ _FAR = 2000.0  # [m] where float32 tells places a tenth of a millimeter apart
 _AROUND = 2.0  # [m] of the map around the base that decides what the robot touches
 
 
-def working_world(world: GridWorld) -> tuple[GridWorld, np.ndarray]:
+def working_world(
+    world: GridWorld, goal: ConfigurationGoal | None = None
+) -> tuple[GridWorld, np.ndarray]:
     """The world that planners work in, and what to add (2,) to its places [m].
 
-    It begins at the corner of the map. A subclass with an ``is_free`` of its own knows the places
-    of the map, and stays as it is.
+    It begins at the corner of the map. A subclass of a world or a goal may know places of the map:
+    with one, the world stays as it is.
 
     Raises:
         ValueError: such a subclass, on a map so far away that float32 has too few digits.
     """
     corner = corner_of(world)
-    if not overrides_is_free(world):
+    of_ones_own = [
+        type(thing).__name__
+        for thing in (world, goal)
+        if type(thing) not in (GridWorld, CarWorld, ConfigurationGoal, type(None))
+    ]
+    if not of_ones_own:
         return from_corner(world), corner
     if np.abs(corner).max() > _FAR:
         raise ValueError(
-            f"the map begins at {tuple(corner.tolist())} m, too far away for the is_free of "
-            f"{type(world).__name__}; shift the map's origin to within {_FAR:g} m of 0"
+            f"the map begins at {tuple(corner.tolist())} m, too far away for the places that "
+            f"{' and '.join(of_ones_own)} may know; shift the map's origin to within {_FAR:g} m of "
+            "0"
         )
     return world, np.zeros(2)
 

@@ -93,7 +93,7 @@ def build_world(
         "floor": _float(floor),
         "planar_boxes": robot.planar_boxes,
         "shapes": robot.shapes,
-        "base": _round_base(robot, grid),
+        "base": _round_base(robot, grid, np.asarray(spheres.link)),
         "near": tuple(make_near_cells(grid, radius[reach == r].max()) for r in np.unique(reach)),
         "groups": tuple(np.unique(reach, return_counts=True)[1].tolist()),
         "field": make_field(grid),
@@ -167,16 +167,20 @@ def _fitting(planar: bool, grid: Grid) -> Grid:
     return grid
 
 
-def _round_base(robot: MobileRobot, grid: Grid) -> RoundBase | None:
-    footprint = robot.footprint
-    if footprint is None:
+def _round_base(robot: MobileRobot, grid: Grid, sphere_link: np.ndarray) -> RoundBase | None:
+    footprint, shapes = robot.footprint, robot.shapes
+    if footprint is None or shapes is None:
         return None
+    is_arm = np.array(shapes.link) > robot.base_dim + 1
+    is_boxed = np.isin(sphere_link, shapes.box_link)
     low = grid.flatten(0.0, float(footprint.height))
     return RoundBase(
         near=make_near_cells(low, float(footprint.radius)),
         radius=footprint.radius,
         height=footprint.height,
         link=footprint.link,
+        capsules=tuple(np.flatnonzero(is_arm).tolist()),
+        spheres=tuple(np.flatnonzero(is_boxed).tolist()),
     )
 
 

@@ -13,8 +13,9 @@ import nrp_jax
 from nrp_jax import planner, viz
 from nrp_jax.bench import planning
 from nrp_jax.cli import main
-from nrp_jax.planner import Status, plan, trajectory_of
+from nrp_jax.planner import Status, plan
 from nrp_jax.scene.exact import ExactScene, Verification, verify
+from nrp_jax.scene.trajectory import trajectory_of
 from vrrt_jax.core.planners import RRTStar
 from vrrt_jax.core.shortcut import shortcut
 from vrrt_jax.core.types import pytree
@@ -75,7 +76,7 @@ class Doorman:
 
 def check(result, start=START, goal=GOAL):
     assert result.ok and result.verification.ok
-    np.testing.assert_allclose(result.path[0], start, atol=1e-5)
+    np.testing.assert_array_equal(result.path[0], start)
     np.testing.assert_allclose(result.path[-1], goal, atol=1e-5)
     assert result.verification.checked >= len(result.trajectory)
     assert result.raw_path.shape[1] == len(start)

@@ -139,6 +139,8 @@ def test_thresholds_are_those_of_the_file(tmp_path):
     assert ros(tmp_path, gray, "occupied_thresh: 2e-1\nfree_thresh: 0.9\n").sum() == 1
     with pytest.warns(UserWarning, match="gray 205 .* is free as free_thresh is 0.25"):
         assert ros(tmp_path, [[254, 205]], "free_thresh: 0.25\n").all()
+    with pytest.warns(UserWarning, match="counts the alpha channel too; save the image without"):
+        assert ros(tmp_path, [[[205, 205, 205, 255]]]).all()
 
 
 @pytest.mark.parametrize(
@@ -258,6 +260,31 @@ def test_planes_are_solid_behind(tmp_path):
     between = (middle[:, 1] > 0.2) & (middle[:, 1] < 3.8)
     assert solid[height < -0.01].all() and not solid[between & (height > 0.09)].any()
     assert 0.1 < solid.mean() < 0.9
+
+
+@pytest.mark.parametrize("height", [-0.4, 0.0, 0.001, 0.3])
+@pytest.mark.parametrize("tilt", [0.0, 0.0008])  # 90 degrees as 1.57 rad
+def test_heights_are_those_above_the_floor(tmp_path, height, tilt):
+    geoms = f"""<geom type='plane' size='0 0 1' pos='0 0 -9'/>
+        <body pos='0 0 {height}' euler='0 {tilt} 0'><geom type='plane' size='9 9 1'/></body>
+        <geom type='box' pos='2 2 {height + 0.5}' size='.2 .2 .1'/>"""
+    low = np.argwhere(scene(tmp_path, geoms).occupied)[:, 2]
+    assert low.min() == 4 and low.max() == 5
+
+
+def test_thin_geoms_between_cells_are_solid(tmp_path):
+    for half in (1e-9, 1e-5, 4e-5):
+        sheet = f"<geom type='box' pos='1 1 .5' size='{half} 1 .5'/>"
+        post = f"<geom type='capsule' fromto='3 1 0 3 1 1' size='{half}'/>"
+        found = scene(tmp_path, sheet + post + "<geom type='box' pos='4 1 .5' size='.5 .5 .5'/>")
+        solid = np.argwhere(found.occupied[:, :, :10].any(axis=2)) + np.round(
+            np.array(found.origin[:2]) / 0.1
+        ).astype(int)
+        assert {*map(tuple, solid)} == (
+            {(x, y) for x in (9, 10) for y in range(20)}
+            | {(x, y) for x in (29, 30) for y in (9, 10)}
+            | {(x, y) for x in range(35, 45) for y in range(5, 15)}
+        ), half
 
 
 def test_a_room_of_planes_only(tmp_path):

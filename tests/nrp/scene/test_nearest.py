@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import nrp_jax
-from nrp_jax.planner import check_configuration, plan
+from nrp_jax.planner import plan
+from nrp_jax.scene.configurations import check_configuration
 from nrp_jax.scene.exact import ExactScene
+from vrrt_jax.core.types import pytree
 
 pytestmark = pytest.mark.light_compilation
 
@@ -31,7 +33,7 @@ def room(fetch):
     return grid, nrp_jax.build_world(fetch, grid)
 
 
-@pytest.mark.parametrize("torso", [0.02, 0.05, 0.1, 0.2, 0.386])
+@pytest.mark.parametrize("torso", [0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.386])
 def test_the_pose_that_a_fetch_drives_in_is_free(fetch, room, torso):
     grid, world = room
     q = TUCK.copy()
@@ -110,7 +112,8 @@ def test_plans_are_the_same_up_to_the_shift(tmp_path):
         world = nrp_jax.build_world(robot, grid)
         result = plan(robot, grid, start + shift, goal + shift, key=jax.random.key(0), world=world)
         assert result.ok
-        np.testing.assert_allclose(result.path[0], start + shift, rtol=0, atol=1e-6)
+        for path in (result.path, result.trajectory, result.raw_path):
+            np.testing.assert_array_equal(path[0], start + shift)
         np.testing.assert_allclose(result.path[-1], goal + shift, rtol=0, atol=1e-6)
         paths.append(result.path - shift)
         tree = np.asarray(result.tree.q)[: int(result.tree.size), :2] - origin
@@ -138,8 +141,30 @@ def test_a_constraint_of_ones_own_sees_the_places_of_the_map():
     with pytest.raises(ValueError, match="the start is refused by West.is_free"):
         check_configuration(robot, world, q, "start")
     far = nrp_jax.with_grid(world, dataclasses.replace(grid, origin=(500000.0, 4600000.0)))
-    with pytest.raises(ValueError, match="too far away for the is_free of West; shift the map"):
+    with pytest.raises(ValueError, match="too far away for the places that West may know"):
         check_configuration(robot, far, q + np.append([499900.0, 4599950.0], np.zeros(6)), "start")
+
+
+@pytree
+class Beyond(nrp_jax.ConfigurationGoal):
+    """Any place east of a line on the map."""
+
+    def loss(self, world, q):
+        return jnp.maximum(102.0 - q[0], 0.0)
+
+
+def test_a_goal_of_ones_own_sees_the_places_of_the_map():
+    robot = nrp_jax.load_robot("snake")
+    q = np.array([101.0, 52.0, 0.6, 1.0, -0.8, 1.0, -0.8, 0.9])
+    grid = nrp_jax.Grid(occupied=np.zeros((40, 40), bool), origin=(100.0, 50.0))
+    goal = Beyond(q=q + np.append([2.0, 0.5], np.zeros(6)))
+    result = plan(robot, grid, q, goal, key=jax.random.key(0), planner="rrt", capacity=2048)
+    assert result.ok and result.path[-1, 0] >= 102.0 - 1e-4
+    np.testing.assert_array_equal(result.path[0], q)
+    far = dataclasses.replace(grid, origin=(500000.0, 4600000.0))
+    shift = np.append([499900.0, 4599950.0], np.zeros(6))
+    with pytest.raises(ValueError, match="too far away for the places that Beyond may know"):
+        plan(robot, far, q + shift, Beyond(q=goal.q + shift), key=jax.random.key(0))
 
 
 def test_a_picture_of_a_long_map_is_small(tmp_path):

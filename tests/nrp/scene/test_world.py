@@ -13,6 +13,7 @@ from nrp_jax.bench import checks
 from nrp_jax.bench.checks import SphereLoop
 from nrp_jax.homes.grid import load_map
 from nrp_jax.scene.exact import ExactScene, merge_cells
+from nrp_jax.scene.link_shapes import segment_to_cylinder
 from nrp_jax.scene.near_cells import make_near_cells, touches
 from nrp_jax.scene.world import CarWorld
 from vrrt_jax.core.edges import free_prefix
@@ -129,6 +130,18 @@ def test_the_floor_stops_the_arm():
     q[:, :2], q[:, 3] = 3.0, 0.1
     q[1, 5] = 1.2  # the straight arm points down
     assert nrp_jax.batch_is_free(world, q).tolist() == [True, False]
+
+
+def test_segments_and_an_upright_cylinder(rng):
+    """Against the nearest of many points along each segment."""
+    start, end = rng.uniform(-0.6, 0.6, (2, 3, 500))
+    end[:, :50] = start[:, :50]  # points
+    start[:2, 50:60] = end[:2, 50:60] = 0.0  # on the axis
+    found = np.asarray(segment_to_cylinder(start, end - start, 0.28, 0.37))
+    point = start + np.linspace(0, 1, 2001)[:, None, None] * (end - start)
+    beside = np.maximum(np.linalg.norm(point[:, :2], axis=1) - 0.28, 0)
+    exact = np.hypot(beside, np.maximum(point[:, 2] - 0.37, 0)).min(axis=0)
+    assert np.all(found <= exact + 1e-6) and np.all(found > exact - 2e-3)
 
 
 def test_another_home_does_not_compile_again(worlds):
