@@ -148,11 +148,11 @@ def read_json(path: str | Path) -> Any:
     """
     try:
         return json.loads(
-            Path(path).read_text(encoding="utf-8"), object_pairs_hook=_without_duplicates
+            Path(path).read_text(encoding="utf-8-sig"), object_pairs_hook=_without_duplicates
         )
     except OSError as error:
         raise FileNotFoundError(f"cannot read '{path}': {error.strerror}") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"'{path}' is not valid JSON: {error}") from None
 
 

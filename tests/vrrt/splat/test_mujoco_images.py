@@ -22,14 +22,15 @@ def test_threads_draw_with_one_renderer(arm, rng):
     robot, spec = arm
     camera = orbit(azimuth_deg=0, elevation_deg=-20, distance=2.0, height=48, width=48)
     poses = rng.uniform(robot.lower, robot.upper, (12, robot.num_joints))
+
+    def drawn(renderer, apply=map):
+        return list(apply(lambda q: renderer.picture(q, camera).rgb, poses))
+
     here = MeshRenderer(spec)
-    expected = [here.picture(q, camera).rgb for q in poses]
+    expected = drawn(here)
     assert len({image.tobytes() for image in expected}) > 6
     with ThreadPoolExecutor(3) as pool:
         for _ in range(2):
-            shared = MeshRenderer(spec)
-            drawn = list(pool.map(lambda q: shared.picture(q, camera).rgb, poses))  # noqa: B023
-            np.testing.assert_array_equal(drawn, expected)
-            del shared
+            np.testing.assert_array_equal(drawn(MeshRenderer(spec), pool.map), expected)
             gc.collect()
-    np.testing.assert_array_equal(here.picture(poses[0], camera).rgb, expected[0])
+    np.testing.assert_array_equal(drawn(here), expected)
