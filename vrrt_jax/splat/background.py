@@ -157,7 +157,8 @@ def _check_covered(is_robot: np.ndarray, valid: np.ndarray) -> None:
 
 def _check_outline(is_robot: np.ndarray, apart: np.ndarray) -> None:
     """Raise a ValueError if what differs from the background fades into it, as shading does."""
-    outline = is_robot & ~ndimage.binary_erosion(is_robot, border_value=1)
+    inside = np.asarray(ndimage.binary_erosion(is_robot, border_value=1), bool)
+    outline = is_robot & ~inside
     change = ndimage.maximum_filter(apart, 5) - ndimage.minimum_filter(apart, 5)
     faint = np.mean(change[outline] < FAINT) if outline.any() else 0.0
     if faint > MAX_FAINT:
