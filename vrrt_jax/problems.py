@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vrrt_jax.checks import check_limits
 from vrrt_jax.core.fields import check_fields
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots import Robot, load_robot, robot_names, scenes_dir
@@ -71,11 +72,14 @@ def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
     fields = read_json(file)
     check_fields(fields, FIELDS, f"'{file}'")
     try:
-        robot = load_robot(_beside(folder, fields["robot"]))
+        robot = load_robot(_beside(folder, fields["robot"], "robot"))
         self_model = fields.get("self_model")
-        self_model = None if self_model is None else _beside(folder, self_model)
+        self_model = None if self_model is None else _beside(folder, self_model, "self_model")
+        true_goal = fields.get("true_goal")
         views = _checked_views(fields["views"], file)
-        images = tuple(read_image(folder / view["image"]) for view in views)
+        images = tuple(
+            read_image(folder / _beside(folder, view["image"], "image")) for view in views
+        )
         cameras = tuple(
             camera_from_dict(view["camera"], image.shape[:2])
             for view, image in zip(views, images, strict=True)
@@ -83,12 +87,12 @@ def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
         return Problem(
             name=folder.resolve().name,
             robot=robot,
-            world=load_world(_beside(folder, fields["world"]), robot, engine=engine),
+            world=load_world(_beside(folder, fields["world"], "world"), robot, engine=engine),
             self_model=load_self_model(self_model_path(robot, self_model)),
             cameras=cameras,
             goal_images=images,
             q_start=_vector(fields["start"], "start"),
-            true_goal=_vector(fields["true_goal"], "true_goal") if "true_goal" in fields else None,
+            true_goal=None if true_goal is None else check_limits(robot, true_goal, "true_goal"),
         )
     except KeyError as error:
         raise ValueError(f"'{file}' lacks the field {error}; see the packaged problems") from None
@@ -148,11 +152,11 @@ def read_json(path: str | Path) -> Any:
     """
     try:
         return json.loads(
-            Path(path).read_text(encoding="utf-8"), object_pairs_hook=_without_duplicates
+            Path(path).read_text(encoding="utf-8-sig"), object_pairs_hook=_without_duplicates
         )
     except OSError as error:
         raise FileNotFoundError(f"cannot read '{path}': {error.strerror}") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"'{path}' is not valid JSON: {error}") from None
 
 
@@ -169,8 +173,14 @@ def _checked_views(views: Any, file: Path) -> list[dict[str, Any]]:
     return views
 
 
-def _beside(folder: Path, name: str) -> str:
-    """A file of a problem's folder, if it is there; otherwise the name as it is."""
+def _beside(folder: Path, name: Any, what: str) -> str:
+    """A file of a problem's folder, if it is there; otherwise the name as it is.
+
+    Raises:
+        ValueError: it is no text.
+    """
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"{what} is {name!r}; expected a name or a path")
     return str(folder / name) if (folder / name).is_file() else name
 
 

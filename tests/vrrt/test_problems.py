@@ -21,6 +21,11 @@ VIEW = FIELDS["views"][0]
         ({"views": [VIEW | {"camera": VIEW["camera"] | {"roll": 3}}]}, "unknown fields: roll"),
         ({"views": []}, r"views of .* is \[\]"),
         ({"views": VIEW}, "expected a list of images and cameras"),
+        ({"views": [VIEW | {"image": 3}]}, "image is 3; expected a name or a path"),
+        ({"robot": None}, "robot is None; expected a name or a path"),
+        ({"world": {"name": "posts"}}, "world is .*; expected a name or a path"),
+        ({"true_goal": [0.0, 1.0]}, r"true_goal has shape \(2,\)"),
+        ({"true_goal": [9.0] * 7}, "true_goal is outside the limits"),
         ({"views": ["goal.png"]}, "view 0 .* is a str; expected an object"),
     ],
 )

@@ -47,18 +47,22 @@ def frozen_positions(
     """
     names = [model.joint(j).name for j in range(model.njnt)]
     frozen = dict(freeze or {})
-    for name, value in frozen.items():
+    for name, value in (freeze or {}).items():
         if name not in names:
             raise ValueError(f"freeze: joint '{name}' not in robot; have: {', '.join(names)}")
-        if not np.isfinite(value):
+        try:
+            frozen[name] = float(value)
+        except (TypeError, ValueError):
+            frozen[name] = np.nan
+        if not np.isfinite(frozen[name]):
             raise ValueError(
-                f"freeze: joint '{name}' got {value}; expected a finite position [rad] or [m]"
+                f"freeze: joint '{name}' got {value!r}; expected a finite position [rad] or [m]"
             )
         joint = model.joint(name)
         low, high = joint.range
-        if model.jnt_limited[joint.id] and not low <= value <= high:
+        if model.jnt_limited[joint.id] and not low <= frozen[name] <= high:
             raise ValueError(
-                f"freeze: joint '{name}' got {value:g}; expected a position in its range, "
+                f"freeze: joint '{name}' got {frozen[name]:g}; expected a position in its range, "
                 f"[{low:g}, {high:g}]"
             )
     coupled = follow(model, home, frozen)

@@ -8,9 +8,10 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from vrrt_jax.robots.urdf import bad_urdf_limits, urdf_root
+from vrrt_jax.robots.urdf import bad_urdf_joints, urdf_root
 
 _LARGEST = 1e3  # [rad] or [m] a larger limit stands for none, and angles would lose their digits
+_MANY_TURNS = 8 * np.pi  # [rad] a larger limit of a hinge may be meant in degrees
 _UNPLANNED = {
     int(mujoco.mjtJoint.mjJNT_FREE): "free",
     int(mujoco.mjtJoint.mjJNT_BALL): "ball",
@@ -32,7 +33,7 @@ def bad_ranges(spec: mujoco.MjSpec, path: Path) -> dict[str, str]:
     """
     root = urdf_root(path)
     if root is not None:
-        return bad_urdf_limits(root)
+        return bad_urdf_joints(root)
     found = {}
     for joint in spec.joints:
         low, high = (float(limit) for limit in joint.range)
@@ -114,6 +115,13 @@ def check_joints(model: mujoco.MjModel, bad_ranges: Mapping[str, str]) -> None:
                 f"+-{_LARGEST:g} [rad] or [m]: correct it, leave it out where a hinge turns for "
                 f'ever (in a URDF, type="continuous"), or fix the joint with '
                 f"freeze={{'{name}': 0.0}}"
+            )
+        is_hinge = kind == mujoco.mjtJoint.mjJNT_HINGE
+        if is_hinge and model.jnt_limited[joint] and max(-low, high) > _MANY_TURNS:
+            warnings.warn(
+                f"joint '{name}' has the range [{low:g}, {high:g}] rad, of many turns: it is "
+                "planned so; if it is meant in degrees, write it in radians",
+                stacklevel=4,
             )
 
 

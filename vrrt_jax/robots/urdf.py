@@ -1,5 +1,6 @@
 """What MuJoCo does not do with a URDF file: find its meshes, and mind what its limits say."""
 
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import unquote
@@ -10,18 +11,32 @@ import numpy as np
 
 _PACKAGES = ("package://", "model://", "$(find ")  # before the name of a package
 _FILE = "file://"
+_XACRO = tuple(
+    f"{{http://{site}/xacro}}" for site in ("www.ros.org/wiki", "ros.org/wiki", "wiki.ros.org")
+)
 _READ = (".stl", ".obj", ".msh")  # endings of the meshes that MuJoCo reads
 _LIMITED = ("revolute", "prismatic")
+_MOVING = (*_LIMITED, "continuous")
 _NAMES = {"lower", "upper"}
 _MOST_PARENTS = 6  # folders above the file that meshes are looked for in
 
 
 def urdf_root(path: Path) -> ElementTree.Element | None:
-    """The root of a URDF file; None for a file of another kind."""
+    """The root of a URDF file; None for a file of another kind.
+
+    Raises:
+        ValueError: it is a xacro file, which only becomes a URDF.
+    """
     try:
         root = ElementTree.parse(path).getroot()
     except ElementTree.ParseError:
         return None
+    for element in root.iter():
+        if str(element.tag).startswith(_XACRO):
+            raise ValueError(
+                f"it has the element xacro:{str(element.tag).partition('}')[2]}, of which a URDF "
+                f"is yet to be made: xacro {path.name} > {path.stem.removesuffix('.urdf')}.urdf"
+            )
     return root if root.tag == "robot" else None
 
 
@@ -47,6 +62,7 @@ def urdf_spec(root: ElementTree.Element, path: Path, *, visuals: bool) -> mujoco
                 limit.set(name, limit.get(name, "0"))  # MuJoCo takes one alone for none at all
     compiler.set("discardvisual", "false" if visuals else "true")
     folder = path.resolve().parent
+    packages = {_package(mesh.get("filename", "")) for _, _, mesh in _meshes(root)} - {""}
     for link, kind, mesh in _meshes(root):
         if kind == "visual" and not visuals:
             continue
@@ -59,6 +75,13 @@ def urdf_spec(root: ElementTree.Element, path: Path, *, visuals: bool) -> mujoco
             raise ValueError(
                 f"mesh '{name}' of link '{link}' is a {there.suffix} file; expected one of "
                 f"{', '.join(_READ)}: convert it, and write the new name into the URDF"
+            )
+        package = _package(name)
+        if len(packages) > 1 and package and package not in there.parts:
+            warnings.warn(
+                f"mesh '{name}' of link '{link}' is taken from '{there}', which is in no folder "
+                f"'{package}': is it that of another package?",
+                stacklevel=6,
             )
         mesh.set("filename", str(there.resolve()))
     compiler.attrib.pop("meshdir", None)
@@ -76,11 +99,19 @@ def _meshes(root: ElementTree.Element) -> Iterator[tuple[str, str, ElementTree.E
                 yield link.get("name", ""), kind, mesh
 
 
+def _package(name: str) -> str:
+    """The package that the URL of a mesh names, or ''."""
+    scheme = next((scheme for scheme in _PACKAGES if name.startswith(scheme)), None)
+    return "" if scheme is None else name.removeprefix(scheme).partition("/")[0].rstrip(")")
+
+
 def _places(name: str, folder: Path, meshdir: str) -> Iterator[Path]:
     """Where a mesh may be, the likeliest place first."""
     name = name.strip().replace("\\", "/")
+    if "%" in name and "://" in name:
+        yield from _places(unquote(name), folder, meshdir)
     if name.startswith(_FILE):
-        name = unquote(name.removeprefix(_FILE)).removeprefix("localhost")
+        name = name.removeprefix(_FILE).removeprefix("localhost")
     parents = [folder, *folder.parents[:_MOST_PARENTS]]
     for scheme in _PACKAGES:
         if name.startswith(scheme):
@@ -104,14 +135,23 @@ def _not_found(name: str, link: str, places: list[Path]) -> str:
     )
 
 
-def bad_urdf_limits(root: ElementTree.Element) -> dict[str, str]:
-    """What is wrong with the limits of joints that have some, by name: words that follow it.
+def bad_urdf_joints(root: ElementTree.Element) -> dict[str, str]:
+    """What is wrong with joints, most of all with their limits, by name: words that follow it.
 
-    Only a ``continuous`` joint turns for ever. A limit that is left out is 0.
+    Only a ``continuous`` joint turns for ever. A limit that is left out is 0. A joint that mimics
+    what does not move would be planned by itself.
     """
     found = {}
+    moving = [j.get("name", "") for j in root.findall("joint") if j.get("type") in _MOVING]
     for joint in root.findall("joint"):
         kind, limit = joint.get("type", ""), joint.find("limit")
+        mimic = joint.find("mimic")
+        if mimic is not None and mimic.get("joint") not in moving:
+            found[joint.get("name", "")] = (
+                f"mimics '{mimic.get('joint')}', which is no joint that moves; expected one of "
+                f"{', '.join(moving)}: correct the name"
+            )
+            continue
         if kind not in _LIMITED:
             continue
         given = {} if limit is None else limit.attrib

@@ -186,15 +186,36 @@ def check_obstacle(obstacle: Obstacle) -> None:
             f"collision between the robot's spheres and '{obstacle.name}' ({obstacle.kind}) is not "
             f"supported; use one of {', '.join(KINDS)}"
         )
-    if not (np.all(np.isfinite(obstacle.position)) and np.all(np.isfinite(obstacle.quaternion))):
-        raise ValueError(f"obstacle '{obstacle.name}' has a pose that is not finite")
+    position, quaternion, size = (
+        _numbers(value) for value in (obstacle.position, obstacle.quaternion, obstacle.size)
+    )
+    is_pose = position.shape == (3,) and quaternion.shape == (4,)
+    if not (is_pose and np.all(np.isfinite(position)) and np.all(np.isfinite(quaternion))):
+        raise ValueError(
+            f"obstacle '{obstacle.name}' has a pose that is not finite: position "
+            f"{obstacle.position!r}, quaternion {obstacle.quaternion!r}; expected x, y, z [m] and "
+            "w, x, y, z"
+        )
+    if not np.any(quaternion):
+        raise ValueError(
+            f"obstacle '{obstacle.name}' has a quaternion of zeros; expected (1, 0, 0, 0) where it "
+            "is not turned"
+        )
     needed = KINDS[obstacle.kind].num_sizes
-    size = np.asarray(obstacle.size[:needed])
-    if not np.all(np.isfinite(size) & (size > 0)):
+    used = size[:needed] if size.ndim == 1 else np.full(1, np.nan)
+    if len(used) < needed or not np.all(np.isfinite(used) & (used > 0)):
         raise ValueError(
             f"obstacle '{obstacle.name}' ({obstacle.kind}) has size {obstacle.size}; expected "
             f"{needed} positive numbers [m]"
         )
+
+
+def _numbers(values: Any) -> np.ndarray:
+    """Numbers as an array; NaN for what is none."""
+    try:
+        return np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        return np.array(np.nan)
 
 
 def floats(values: Any) -> Any:

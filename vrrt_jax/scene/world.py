@@ -95,7 +95,11 @@ def is_free(world: World, q: jax.Array) -> jax.Array:
 
     Limits are not checked. Pure and vmappable; fast inside any ``jit``. This is ``world.is_free``,
     so that a subclass that overrides it is obeyed.
+
+    Raises:
+        ValueError: ``q`` has another shape.
     """
+    _check_shape(world, q)
     return world.is_free(q)
 
 
@@ -112,8 +116,21 @@ def batch_clearance(world: "World", q: jax.Array) -> jax.Array:
 
 @single_precision
 def obstacle_clearance(world: World, q: jax.Array) -> jax.Array:
-    """Distance () [m] of the collision spheres at ``q`` (D,) to the nearest obstacle."""
+    """Distance () [m] of the collision spheres at ``q`` (D,) to the nearest obstacle.
+
+    Raises:
+        ValueError: ``q`` has another shape.
+    """
+    _check_shape(world, q)
     return world.obstacle_clearance(q)
+
+
+def _check_shape(world: World, q: Any) -> None:
+    if np.shape(q) != (len(world.joint_names),):
+        raise ValueError(
+            f"the configuration has shape {np.shape(q)}; expected ({len(world.joint_names)},) for "
+            f"the joints {', '.join(world.joint_names)}: vmap over many"
+        )
 
 
 @single_precision

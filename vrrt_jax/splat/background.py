@@ -17,9 +17,12 @@ MAX_BORDER = 0.4  # largest share of the border that can be robot
 MAX_COVERED = 0.9  # largest share of an image that can be robot
 MIN_COVERED = 1e-3  # and the least
 SPECK = 1e-4  # share of an image below which a patch, or a hole, is noise
-COLORFUL = 0.2  # difference of channels from which on a background's color bleeds
+COLORFUL = 0.12  # difference of channels from which on a background's color bleeds
+MIN_FAINT = 3e-3  # share of faint pixels from which on a picture has lost something
 BLEED_PX = 4  # how far
 OFF_LINE = 0.35  # how far off the line between two colors their mixtures are, of its length
+FAINT = 2 / 255  # change of color across an outline that is none
+MAX_FAINT = 0.2  # largest share of the robot's outline that can be so
 OWN_COLOR = 0.9  # share of its own color from which on a pixel of the robot is not mended
 
 
@@ -49,10 +52,12 @@ def robot_on_plain_background(
     if spread > MAX_SPREAD:
         raise _not_plain(apart > MAX_TOLERANCE)
     is_robot = apart > max(_noise(off, apart), OF_SPREAD * spread)
-    if np.ptp(color) > COLORFUL:
+    # Without loss nothing bleeds.
+    if np.ptp(color) > COLORFUL and np.mean(_is_faint(apart)) > MIN_FAINT:
         image, is_robot = _without_bleeding(image, color, apart, is_robot)
     is_robot = _without_specks(is_robot, apart, spread)
     _check_covered(is_robot, valid)
+    _check_outline(is_robot & valid, apart)
     return image, is_robot.astype(np.float32)
 
 
@@ -67,7 +72,7 @@ def _noise(off: np.ndarray, apart: np.ndarray) -> float:
     It takes nothing from what is evenly shaded, such as a robot in nearly the background's color,
     but much from the ripples that JPEG leaves beside an edge.
     """
-    faint = (apart > 0.1 * MIN_TOLERANCE) & (apart <= MAX_TOLERANCE)
+    faint = _is_faint(apart)
     if not faint.any():
         return MIN_TOLERANCE
     # Only around faint pixels: the filter is slow.
@@ -76,6 +81,10 @@ def _noise(off: np.ndarray, apart: np.ndarray) -> float:
     residue = np.abs(off[part] - ndimage.median_filter(off[part], size=(3, 3, 1))).max(axis=-1)
     level = OF_RESIDUE * float(np.median(residue[faint[part]]))
     return float(np.clip(level, MIN_TOLERANCE, MAX_TOLERANCE))
+
+
+def _is_faint(apart: np.ndarray) -> np.ndarray:
+    return (apart > 0.1 * MIN_TOLERANCE) & (apart <= MAX_TOLERANCE)
 
 
 def _without_bleeding(
@@ -144,6 +153,20 @@ def _check_covered(is_robot: np.ndarray, valid: np.ndarray) -> None:
     seen = is_robot & valid
     if seen.mean() > MAX_COVERED or _border(seen).mean() > MAX_BORDER:
         raise _not_plain(seen)
+
+
+def _check_outline(is_robot: np.ndarray, apart: np.ndarray) -> None:
+    """Raise a ValueError if what differs from the background fades into it, as shading does."""
+    inside = np.asarray(ndimage.binary_erosion(is_robot, border_value=1), bool)
+    outline = is_robot & ~inside
+    change = ndimage.maximum_filter(apart, 5) - ndimage.minimum_filter(apart, 5)
+    faint = np.mean(change[outline] < FAINT) if outline.any() else 0.0
+    if faint > MAX_FAINT:
+        raise ValueError(
+            f"the background of the goal image is not plain: {100 * faint:.0f} % of the outline of "
+            "what differs from its color is no edge, but shading or a shadow; light the background "
+            "evenly, or give the robot's mask as fourth channel"
+        )
 
 
 def _not_plain(differs: np.ndarray) -> ValueError:

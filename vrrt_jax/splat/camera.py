@@ -1,6 +1,7 @@
 """Cameras: from a point of view to pixels."""
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,6 +16,8 @@ from vrrt_jax.splat.types import Camera
 MIN_FOVY_DEG, MAX_FOVY_DEG = 4.0, 150.0
 MAX_ASPECT = 2.0  # ratio of the two focal lengths
 MAX_DISTANCE_M = 100.0  # from the world's origin; farther ones are in mm
+NOT_A_ROTATION = 3e-3  # how far a rotation is off if it is written with three decimals
+USUAL_CENTRE = 0.1, 0.9  # in units of the image; elsewhere it may be of another image
 
 
 @single_precision
@@ -115,6 +118,14 @@ def camera_from_matrix(
             f"the principal point (centre) is {point.tolist()}; expected pixels, about "
             f"{middle} in the middle of the image"
         )
+    low, high = (share * np.array([width, height]) for share in USUAL_CENTRE)
+    if np.any((point < low) | (point > high)):
+        warnings.warn(
+            f"the principal point (centre) is {point.tolist()}, far from the middle of an image of "
+            f"{width}x{height} px, {middle}: is it of this image, and not of one of another size? "
+            "Right after cropping",
+            stacklevel=3,
+        )
     return Camera(
         world_to_cam=jnp.asarray(world_to_cam, jnp.float32),
         focal=jnp.float32(fy),
@@ -149,7 +160,7 @@ def _rigid(world_to_cam: np.ndarray) -> np.ndarray:
     rotation = matrix[:3, :3]
     if (
         not np.all(np.isfinite(matrix))
-        or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+        or not np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=NOT_A_ROTATION)
         or np.linalg.det(rotation) < 0
     ):
         raise ValueError(
@@ -162,7 +173,13 @@ def _rigid(world_to_cam: np.ndarray) -> np.ndarray:
             f"the camera is {distance:.0f} m away from the world's origin; expected at most "
             f"{MAX_DISTANCE_M:g}: give positions in meters, not in mm"
         )
-    return matrix
+    if np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-5):
+        return matrix
+    # What few decimals have bent is straightened: the nearest rotation.
+    left, _, right = np.linalg.svd(rotation)
+    straight = matrix.copy()
+    straight[:3, :3] = left @ right
+    return straight
 
 
 def _vector(values: Any, length: int, what: str) -> np.ndarray:

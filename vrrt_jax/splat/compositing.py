@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from vrrt_jax.core.precision import single_precision
+
 MIN_WEIGHT = 1e-37  # added to weights before a division
 
 
@@ -63,7 +65,8 @@ def _composite_bwd(residuals, image_grad):
     return (jnp.concatenate(sums_grad).reshape(len(weight), 5, *weight.shape[1:]),)
 
 
-composite_layers.defvjp(_composite_fwd, _composite_bwd)
+# JAX calls these rules itself, in the precision that the user has set.
+composite_layers.defvjp(single_precision(_composite_fwd), single_precision(_composite_bwd))
 
 
 def _merge(a, b):

@@ -17,7 +17,7 @@ import numpy as np
 
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots.mesh_sources import mesh_file
-from vrrt_jax.splat.fit_config import FitConfig, LevelConfig
+from vrrt_jax.splat.fit_config import FitConfig, LevelConfig, check_fit_config
 from vrrt_jax.splat.fit_level import fit_level
 from vrrt_jax.splat.model import Level, SelfModel, save_self_model
 from vrrt_jax.splat.training_images import (
@@ -53,8 +53,10 @@ def fit_self_model(
 
     Raises:
         RuntimeError: OpenGL is not available.
-        ValueError: ``<path>.work/`` belongs to another robot, seed or configuration.
+        ValueError: a setting makes no sense, or ``<path>.work/`` belongs to another robot, seed or
+            configuration.
     """
+    check_fit_config(config)
     path, started = Path(path), time.perf_counter()
     work = path.with_name(path.name + ".work")
     _claim(work, robot, seed, config)

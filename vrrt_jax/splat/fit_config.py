@@ -2,6 +2,8 @@
 
 import dataclasses
 
+FEWEST_SPLATS = 20  # of a level
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LevelConfig:
@@ -40,3 +42,29 @@ class FitConfig:
     close_up: LevelConfig = LevelConfig(num_splats=2400, size_px=96, steps=1500, batch=4)
     close_up_of_px: int = 480
     close_up_off: float = 0.15
+
+
+def check_fit_config(config: FitConfig) -> None:
+    """Raise a ValueError that names a setting which no self-model can be trained with."""
+    levels = {f"levels[{k}]": level for k, level in enumerate(config.levels)}
+    bounds = {
+        "num_images": (config.num_images, 1),
+        "num_surface_images": (config.num_surface_images, 1),
+        "num_validation": (config.num_validation, 1),
+        "number of levels": (len(levels), 1),
+        "learning_rate": (config.learning_rate, 1e-9),
+        "close_up_of_px": (config.close_up_of_px, config.close_up.size_px),
+    }
+    for name, level in (levels | {"close_up": config.close_up}).items():
+        detail = config.detail if name in levels else 1.0
+        bounds |= {
+            f"num_splats of {name}, times detail": (detail * level.num_splats, FEWEST_SPLATS),
+            f"size_px of {name}": (level.size_px, 1),
+            f"steps of {name}": (level.steps, 1),
+            f"batch of {name}": (level.batch, 1),
+        }
+        if name in levels:
+            bounds[f"image_px beside {name}"] = (config.image_px, level.size_px)
+    for name, (value, low) in bounds.items():
+        if not low <= value < float("inf"):
+            raise ValueError(f"{name} is {value:g}; expected a number of at least {low:g}")

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.splat.lanes import each_lane
 from vrrt_jax.splat.projection import ProjectedSplats
 from vrrt_jax.splat.windows import ImageLayout, WindowPlacement, split_layers
@@ -50,7 +51,8 @@ def _sum_bwd(layout, residuals, image_grad):
     return each_lane(cut, whole)(splats, placement, image_grad), None
 
 
-sum_footprints.defvjp(_sum_fwd, _sum_bwd)
+# JAX calls these rules itself, in the precision that the user has set.
+sum_footprints.defvjp(single_precision(_sum_fwd), single_precision(_sum_bwd))
 
 
 def _sum_whole(layout, splats, placement=None):

@@ -1,7 +1,9 @@
 """Images from MuJoCo's own renderer and a robot's true meshes; no screen is needed."""
 
+import atexit
 import contextlib
 import dataclasses
+import threading
 import weakref
 from collections.abc import Iterator, Sequence
 
@@ -18,6 +20,10 @@ MAX_RENDER_PX = 1024  # larger buffers are slow and some drivers refuse them
 VISUAL_GROUPS = (0, 1, 2)
 OBSTACLE_GROUP = 5
 
+_Renderers = dict[tuple[int, int], mujoco.Renderer]  # by height and width [px]
+_orphans: list[tuple[_Renderers, threading.Thread]] = []  # not needed any more, and their threads
+_exiting = threading.Event()
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Picture:
@@ -28,8 +34,21 @@ class Picture:
     valid: np.ndarray  # (H, W) bool, False where an obstacle may hide the robot
 
 
+class _Own(threading.local):
+    """What each thread that draws has for itself: OpenGL is bound to the thread that made it."""
+
+    def __init__(self, model: mujoco.MjModel):
+        self.data = mujoco.MjData(model)
+        self.option = mujoco.MjvOption()
+        self.option.geomgroup[:] = 0
+        for group in VISUAL_GROUPS:
+            self.option.geomgroup[group] = 1
+        self.renderers: _Renderers = {}
+        weakref.finalize(self.data, _close, self.renderers, threading.current_thread())
+
+
 class MeshRenderer:
-    """Renders a robot's meshes at given configurations with given cameras.
+    """Renders a robot's meshes at given configurations with given cameras, in any thread.
 
     The only light sits on the camera, with almost no highlights.
 
@@ -69,13 +88,7 @@ class MeshRenderer:
         spec.visual.quality.offsamples = 0
         spec.visual.global_.offwidth = spec.visual.global_.offheight = MAX_RENDER_PX
         self.model = spec.compile()
-        self.data = mujoco.MjData(self.model)
-        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
-        weakref.finalize(self, _close, self._renderers)  # also at exit, while OpenGL still works
-        self._option = mujoco.MjvOption()
-        self._option.geomgroup[:] = 0
-        for group in VISUAL_GROUPS:
-            self._option.geomgroup[group] = 1
+        self._own = _Own(self.model)
 
     def check(self) -> None:
         """Raise a RuntimeError if OpenGL is not available."""
@@ -142,19 +155,20 @@ class MeshRenderer:
 
     @contextlib.contextmanager
     def _drawing_obstacles(self) -> Iterator[None]:
-        self._option.geomgroup[OBSTACLE_GROUP] = 1
+        self._own.option.geomgroup[OBSTACLE_GROUP] = 1
         try:
             yield
         finally:
-            self._option.geomgroup[OBSTACLE_GROUP] = 0
+            self._own.option.geomgroup[OBSTACLE_GROUP] = 0
 
     def _aim(self, q: np.ndarray, camera: Camera, scale: int) -> mujoco.Renderer:
         """A renderer with the robot posed and the camera placed, ``scale`` pixels per pixel."""
         renderer = self._renderer((camera.height * scale, camera.width * scale))
-        self.data.qpos[:] = q
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_camlight(self.model, self.data)
-        renderer.update_scene(self.data, scene_option=self._option)
+        data = self._own.data
+        data.qpos[:] = q
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_camlight(self.model, data)
+        renderer.update_scene(data, scene_option=self._own.option)
         _set_camera(renderer.scene, camera, self.model)
         return renderer
 
@@ -166,20 +180,39 @@ class MeshRenderer:
                 f"an image of {width}x{height} px is too large to be drawn; expected at most "
                 f"{MAX_RENDER_PX} px on a side"
             )
-        if size not in self._renderers:
+        renderers = self._own.renderers
+        if size not in renderers:
+            _close_orphans()
             try:
-                self._renderers[size] = mujoco.Renderer(self.model, *size)
+                renderers[size] = mujoco.Renderer(self.model, *size)
             except (ImportError, RuntimeError, mujoco.FatalError) as error:
                 raise RuntimeError(
                     "OpenGL is not available for rendering meshes "
                     f"({error}); install libosmesa6 (or libegl1 and libgl1), or set MUJOCO_GL"
                 ) from None
-        return self._renderers[size]
+        return renderers[size]
 
 
-def _close(renderers: dict[tuple[int, int], mujoco.Renderer]) -> None:
+def _close(renderers: _Renderers, thread: threading.Thread) -> None:
+    """Close a thread's renderers: at once, or when that thread draws next, as it has them bound."""
+    is_elsewhere = thread is not threading.current_thread() and thread.is_alive()
+    if is_elsewhere and not _exiting.is_set():
+        _orphans.append((renderers, thread))
+        return
     for renderer in renderers.values():
         renderer.close()
+
+
+def _close_orphans() -> None:
+    for orphan in [_orphans.pop() for _ in range(len(_orphans))]:
+        _close(*orphan)
+
+
+@atexit.register
+def _close_at_exit() -> None:
+    """Close all, while OpenGL still works."""
+    _exiting.set()
+    _close_orphans()
 
 
 def _set_camera(scene: mujoco.MjvScene, camera: Camera, model: mujoco.MjModel) -> None:

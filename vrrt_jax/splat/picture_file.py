@@ -30,7 +30,7 @@ def read_image(path: str | Path) -> np.ndarray:
                     f"'{path}' has {frames} frames; expected one: save the frame that is the goal "
                     "as a PNG"
                 )
-            pixels = _decoded(ImageOps.exif_transpose(picture), path)
+            pixels = _decoded(ImageOps.exif_transpose(picture), path, picture.format == "PPM")
     except FileNotFoundError:
         raise FileNotFoundError(f"no goal image at '{path}'; make one with: vrrt render") from None
     except (
@@ -44,10 +44,11 @@ def read_image(path: str | Path) -> np.ndarray:
     return unit_pixels(pixels, f"'{path}'")
 
 
-def _decoded(picture: Image.Image, path: str | Path) -> np.ndarray:
+def _decoded(picture: Image.Image, path: str | Path, is_pgm: bool) -> np.ndarray:
     """Pixels (H, W, C) in 8 bits, or (H, W) or (H, W, 2) in 16 bits, of a picture."""
     transparent = picture.info.get("transparency")
-    if picture.mode.startswith("I;16"):
+    # Pillow widens the 16 bits of a PGM file to 32.
+    if picture.mode.startswith("I;16") or (picture.mode == "I" and is_pgm):
         grey = np.asarray(picture).astype(np.uint16)
         if transparent is None:
             return grey

@@ -97,7 +97,8 @@ def valid_mask(mask: Any, height: int, width: int) -> np.ndarray:
     """A mask of pixels that are compared, as float32 (H, W) of 0 and 1.
 
     Args:
-        mask: (H, W) or (H, W, 1) of bool, or numbers 0 and 1, or 0 and 255 (or 65535).
+        mask: (H, W) of bool, or numbers 0 and 1, or 0 and 255 (or 65535); also (H, W, C), as
+            :func:`~vrrt_jax.read_image` gives it, with the same in all channels.
         height: H of its image [px].
         width: W of its image [px].
 
@@ -105,7 +106,7 @@ def valid_mask(mask: Any, height: int, width: int) -> np.ndarray:
         ValueError: it has another shape or other values, or is nowhere true.
     """
     mask = np.asarray(mask)
-    if mask.ndim == 3 and mask.shape[2] == 1:
+    if mask.ndim == 3 and mask.shape[2] in (1, 3) and np.all(mask == mask[..., :1]):
         mask = mask[..., 0]
     if mask.shape != (height, width):
         is_turned = mask.shape == (width, height)

@@ -1,5 +1,7 @@
 """What files of robots say and MuJoCo does not mind: limits, URLs, couplings, masks, names."""
 
+import warnings
+
 import mujoco
 import numpy as np
 import pytest
@@ -101,6 +103,29 @@ def test_only_continuous_joints_of_a_urdf_turn_for_ever(tmp_path):
         load_robot(write(tmp_path, text, "slide.urdf"))
 
 
+def test_limits_of_many_turns_may_be_in_degrees(tmp_path):
+    with pytest.warns(UserWarning, match=r"'lift' has the range \[-180, 180\] rad, of many turns"):
+        load_robot(urdf(tmp_path, limit='<limit lower="-180" upper="180"/>'))
+    text = HINGE.replace("LIMITS", 'range="-1 90"')
+    with pytest.warns(UserWarning, match="'lift' has the range .* of many turns"):
+        load_robot(write(tmp_path, text))
+    with warnings.catch_warnings(action="error"):
+        load_robot(urdf(tmp_path, limit='<limit lower="-12.6" upper="12.6"/>'))
+
+
+def test_what_is_no_urdf_yet_is_refused(tmp_path):
+    for site in ("www.ros.org/wiki", "wiki.ros.org"):
+        spaced = f'<robot name="two" xmlns:xacro="http://{site}/xacro">'
+        text = URDF.replace('<robot name="two">', spaced)
+        text = text.replace("LIMIT", LIMIT).replace("GEOMETRY", BALL)
+        assert load_robot(write(tmp_path, text)).num_joints == 2  # the name space alone is no harm
+        text = text.replace("</robot>", '<xacro:include filename="hand.xacro"/></robot>')
+        with pytest.raises(
+            ValueError, match="element xacro:include.*: xacro a.urdf.xacro > a.urdf"
+        ):
+            load_robot(write(tmp_path, text, "a.urdf.xacro"))
+
+
 @pytest.mark.parametrize("limits", ["1 -1", "1 1", "0 0", "nan 1", "-inf inf", "-1 1e9"])
 def test_unclear_ranges_of_mjcf_are_refused_by_name(tmp_path, limits):
     path = write(tmp_path, HINGE.replace("LIMITS", f'range="{limits}"'))
@@ -139,6 +164,7 @@ def package(tmp_path_factory):
         "../meshes/arm one.obj",
         "..\\meshes\\arm one.obj",
         "meshes/arm one.obj",
+        "package://my_arm/meshes/arm%20one.obj",
     ],
 )
 def test_meshes_of_a_urdf_are_found(package, name):
@@ -149,6 +175,20 @@ def test_meshes_of_a_urdf_are_found(package, name):
     assert "arm" in robot.collision_sphere_bodies
     # The exact check reads the same mesh.
     assert vrrt_jax.verify_path(robot, [], np.zeros((1, 2)), geometry="meshes").ok
+
+
+def test_a_mesh_of_another_package_is_told(package):
+    """Where a file names several packages, a folder of none of them may hold the wrong mesh."""
+    name = "package://PACKAGE/meshes/arm one.obj"
+    other = f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
+    text = URDF.replace("LIMIT", LIMIT).replace("GEOMETRY", f'<mesh filename="{name}"/>')
+    text = text.replace("PACKAGE", "hand").replace(
+        '<link name="base"/>', f'<link name="base">{other.replace("PACKAGE", "my_arm")}</link>'
+    )
+    with pytest.warns(UserWarning, match="of link 'arm' is taken from .* in no folder 'hand'"):
+        load_robot(write(package, text, "urdf/two.urdf"))
+    with warnings.catch_warnings(action="error"):
+        load_robot(write(package, text.replace("my_arm", "hand"), "urdf/one.urdf"))
 
 
 def test_a_mesh_that_is_nowhere_is_named_with_what_to_write(package):
@@ -198,6 +238,23 @@ def test_a_mimic_joint_follows(tmp_path):
     assert load_robot(path, freeze={"lift": -0.5}).frozen == pytest.approx(
         {"lift": -0.5, "slide": 0.07}
     )
+
+
+def test_a_joint_that_mimics_nothing_is_refused(tmp_path):
+    text = URDF.replace("LIMIT", LIMIT).replace("GEOMETRY", BALL)
+    text = text.replace('<parent link="arm"/>', '<mimic joint="lif"/><parent link="arm"/>')
+    path = write(tmp_path, text)
+    with pytest.raises(ValueError, match=r"'slide' mimics 'lif', which is no joint that moves; .*"):
+        load_robot(path)
+    assert load_robot(path, freeze={"slide": 0.1}).joint_names == ("lift",)
+
+
+@pytest.mark.parametrize("value", ["open", None, [0.1, 0.2], np.nan])
+def test_what_freezes_a_joint_is_a_number(tmp_path, value):
+    path = write(tmp_path, GRIPPER.replace("TIES", ""))
+    with pytest.raises(ValueError, match="joint 'fl' got .*; expected a finite position"):
+        load_robot(path, freeze={"fl": value})
+    assert load_robot(path, freeze={"fl": np.array(0.01)}).frozen == {"fl": 0.01}
 
 
 def test_what_ties_joints_and_is_not_kept_is_said(tmp_path):

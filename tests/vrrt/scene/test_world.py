@@ -122,7 +122,13 @@ def test_obstacle_list_gives_back_what_went_in(panda, rng):
     [
         ({"kind": "ellipsoid"}, r"robot's spheres and 'thing' \(ellipsoid\) is not supported"),
         ({"size": (0.1, -0.1, 0.1)}, "3 positive numbers"),
+        ({"size": 0.1}, "3 positive numbers"),
+        ({"size": (0.1, 0.1)}, "3 positive numbers"),
         ({"position": (0.0, float("nan"), 0.0)}, "not finite"),
+        ({"position": (0.0, 1.0)}, "expected x, y, z"),
+        ({"position": "0 0 1"}, "expected x, y, z"),
+        ({"quaternion": (1.0, 0.0, 0.0)}, "w, x, y, z"),
+        ({"quaternion": (0.0, 0.0, 0.0, 0.0)}, "a quaternion of zeros"),
     ],
 )
 def test_bad_obstacles_are_refused(panda, change, message):
@@ -239,3 +245,13 @@ def test_an_engine_must_answer(wall_world):
     world = World(**{name: getattr(wall_world, name) for name in names})
     with pytest.raises(NotImplementedError, match="subclass the world of an engine"):
         vrrt_jax.is_free(world, jnp.zeros(7))
+
+
+@pytest.mark.parametrize("shape", [(1,), (8,), (3, 7), ()])
+def test_configurations_of_another_shape_are_refused(wall_world, shape):
+    """One value for all joints would be an answer about another configuration."""
+    for ask in (vrrt_jax.is_free, vrrt_jax.obstacle_clearance):
+        with pytest.raises(
+            ValueError, match=r"has shape .*; expected \(7,\) for the joints joint1"
+        ):
+            ask(wall_world, np.zeros(shape, np.float32))

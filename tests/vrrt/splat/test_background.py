@@ -51,6 +51,14 @@ def test_the_robot_is_told_from_any_color(goal, name):
     assert share_wrong(goal, as_jpeg(pixels, 75)) < 0.05
 
 
+@pytest.mark.parametrize("color", [(0.05, 0.2, 0.05), (0.05, 0.05, 0.2), (0.25, 0.18, 0.1)])
+def test_dark_colors_do_not_bleed_either(goal, color):
+    pixels = on_color(goal, color)
+    assert share_wrong(goal, pixels) < 0.002
+    for quality in (95, 75, 50):
+        assert share_wrong(goal, as_jpeg(pixels, quality)) < 0.06
+
+
 def test_noise_and_slow_shading_are_background(goal, rng):
     pixels = on_color(goal, COLORS["black"]) + rng.normal(scale=3, size=(*goal.shape[:2], 3))
     assert share_wrong(goal, np.clip(pixels, 0, 255)) < 0.01
@@ -75,5 +83,13 @@ def test_other_backgrounds_are_refused(goal, rng):
     for background in (ramp, halves, rng.random((*x.shape, 3))):
         with pytest.raises(ValueError, match=r"expected a plain background: .* fourth channel"):
             robot_on_plain_background(np.where(goal[..., 3:] > 0, goal[..., :3], background))
+    off = np.hypot(x - 0.5, y - 0.5)[..., None]
+    vignette, shadow = 0.5 - 0.1 * off**2, 1 - 0.3 * np.exp(-40 * off**2)
+    for background in (vignette, shadow):
+        for quality in (None, 90):
+            pixels = on_color(goal, background)
+            pixels = pixels if quality is None else as_jpeg(pixels, quality)
+            with pytest.raises(ValueError, match="not plain: .* shading or a shadow; .* fourth"):
+                robot_on_plain_background(pixels.astype(np.float32) / 255)
     with pytest.raises(ValueError, match="is blank"):
         robot_on_plain_background(np.full((60, 80, 3), 0.3))

@@ -1,6 +1,7 @@
 """Cameras from Python and from files: what is given is used, or refused by name."""
 
 import json
+import warnings
 
 import jax.numpy as jnp
 import numpy as np
@@ -63,6 +64,7 @@ def test_both_kinds_of_files_are_the_same_camera():
         (CALIBRATED | {"world_to_cam": MATRIX[:3].tolist()}, r"shape \(3, 4\)"),
         (CALIBRATED | {"world_to_cam": MATRIX.ravel().tolist()}, r"shape \(16,\)"),
         (CALIBRATED | {"world_to_cam": [[1], [1, 2]]}, "not made of numbers"),
+        (CALIBRATED | {"world_to_cam": (MATRIX + 0.01).tolist()}, "not a rigid"),
         (CALIBRATED | {"focal": 0}, "focal is 0"),
         (CALIBRATED | {"focal": np.inf}, "focal is"),
         (CALIBRATED | {"focal": [580, 580, 1]}, "focal is .*; expected 2 finite numbers"),
@@ -90,6 +92,26 @@ def test_bad_files_are_explained(fields, message):
         camera_from_dict(fields, SIZE)
 
 
+def test_matrices_of_few_decimals_are_rotations(rng):
+    for matrix in (look_from(rng.normal(size=3)) for _ in range(30)):
+        camera = camera_from_dict(CALIBRATED | {"world_to_cam": matrix.round(3).tolist()}, SIZE)
+        read = np.asarray(camera.world_to_cam, float)
+        np.testing.assert_allclose(read, matrix, atol=2e-3)
+        np.testing.assert_allclose(read[:3, :3] @ read[:3, :3].T, np.eye(3), atol=1e-6)
+
+
+def look_from(place):
+    return np.asarray(vrrt_jax.look_at(place + [0, 0, 3], (0, 0, 0)).world_to_cam, float)
+
+
+@pytest.mark.parametrize("centre", [[640, 480], [20, 240], [320, -100]])
+def test_a_principal_point_far_off_is_told(centre):
+    with pytest.warns(UserWarning, match="centre. is .* far from the middle of an image"):
+        camera_from_dict(CALIBRATED | {"centre": centre}, SIZE)
+    with warnings.catch_warnings(action="error"):
+        camera_from_dict(CALIBRATED | {"centre": [350, 200]}, SIZE)
+
+
 def test_constructors_refuse_the_same():
     for pair in ((0, 480), (640, 0.5), (np.nan, 480), (640.5, 480)):
         with pytest.raises(ValueError, match="(width|height) is"):
@@ -102,6 +124,15 @@ def test_constructors_refuse_the_same():
             vrrt_jax.orbit(**view | {name: value})
     with pytest.raises(ValueError, match="expected 3 finite numbers"):
         vrrt_jax.orbit(**view, target=(0, 0))
+
+
+def test_files_of_other_editors(tmp_path):
+    file = tmp_path / "camera.json"
+    file.write_text(json.dumps(PLACED), encoding="utf-8-sig")
+    assert read_json(file) == PLACED
+    file.write_text("[" * 100_000)
+    with pytest.raises(ValueError, match="not valid JSON"):
+        read_json(file)
 
 
 def test_a_field_that_is_there_twice_is_refused(tmp_path):

@@ -53,3 +53,25 @@ def test_a_small_self_model_is_trained_and_resumed(arm, tmp_path, monkeypatch):
     assert not path.with_name("arm.npz.work").exists()
     assert model.levels[0].psnr_db > 22 and model.close_up.psnr_db > 18
     assert load_self_model(path).close_up.match_threshold == model.close_up.match_threshold
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"num_images": 0}, "num_images is 0"),
+        ({"num_validation": 0}, "num_validation is 0"),
+        ({"num_surface_images": 0}, "num_surface_images is 0"),
+        ({"levels": ()}, "number of levels is 0"),
+        ({"learning_rate": float("nan")}, "learning_rate is nan"),
+        ({"detail": 0.01}, "num_splats of levels.0., times detail is 0.9"),
+        ({"image_px": 8}, "image_px beside levels.0. is 8; expected .* at least 32"),
+        ({"close_up_of_px": 8}, "close_up_of_px is 8"),
+        ({"levels": (dataclasses.replace(SMALL, steps=0),)}, "steps of levels.0. is 0"),
+    ],
+)
+def test_settings_that_train_nothing_are_refused(arm, tmp_path, change, words):
+    robot, spec = arm
+    config = dataclasses.replace(CONFIG, **change)
+    with pytest.raises(ValueError, match=words):
+        fit.fit_self_model(robot, spec, tmp_path / "arm.npz", seed=0, config=config)
+    assert not list(tmp_path.iterdir())

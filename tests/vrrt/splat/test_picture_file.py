@@ -55,6 +55,12 @@ def test_kinds_of_pixels(tmp_path, picture):
     for path in (file, tmp_path / "a.tif"):
         Image.fromarray(sixteen).save(path)
         np.testing.assert_allclose(vrrt_jax.read_image(path), as_rgb, atol=1e-6)
+    netpbm = tmp_path / "a.pgm"
+    netpbm.write_bytes(b"P5 32 24 65535\n" + sixteen.astype(">u2").tobytes())
+    np.testing.assert_allclose(vrrt_jax.read_image(netpbm), as_rgb, atol=1e-6)
+    twelve = (sixteen.astype(np.float64) / 65535 * 4095).round().astype(">u2")
+    netpbm.write_bytes(b"P5 32 24 4095\n" + twelve.tobytes())
+    np.testing.assert_allclose(vrrt_jax.read_image(netpbm), as_rgb, atol=1e-3)
     write_16_bit_rgb(file, np.asarray(picture))
     np.testing.assert_allclose(vrrt_jax.read_image(file), unit(picture), atol=1e-6)
     for mode, kind in (("L", "png"), ("P", "png"), ("P", "gif"), ("CMYK", "tif"), ("1", "png")):

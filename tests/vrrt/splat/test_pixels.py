@@ -67,6 +67,7 @@ def test_types_of_masks(image):
     for mask in (
         truths,
         truths[..., None],
+        np.repeat(truths[..., None], 3, axis=2),  # as read_image reads it
         truths.astype(np.uint8),
         truths.astype(float),
         truths * 255,
@@ -80,6 +81,7 @@ def test_types_of_masks(image):
     ("mask", "message"),
     [
         (np.ones((80, 60)), "turned by a quarter"),
+        (np.arange(60 * 80 * 3).reshape(60, 80, 3) % 2, r"shape \(60, 80, 3\)"),
         (np.ones((30, 40)), r"shape \(30, 40\); expected \(60, 80\)"),
         (np.full((60, 80), 7), "values from 7 to 7"),
         (np.full((60, 80), np.nan), "values from nan"),
