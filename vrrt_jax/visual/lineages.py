@@ -1,11 +1,11 @@
 """Visual-RRT with lineages: one tree from the start, in which many branches get their turn.
 
-Ranked by loss alone, the branches of one local minimum would take all lanes. So the tree is grown
-in three stages. Random edges scatter from the start. The nodes that then look most like the goal
-found a lineage each, which children inherit; a lineage improves by random jumps from its best node,
-and competes with no other. At last every lineage follows its image gradient, as Visual-RRT does:
-one Adam step a node, whose child inherits the moments. First all lineages take turns, and then the
-best go on.
+Ranked by loss alone, the branches of one local minimum would take all lanes. So every node belongs
+to a lineage, which children inherit and which competes with no other. The tree is grown in three
+stages. Random edges scatter from the start; they take turns among the lineages. Then each lineage
+improves by random jumps from its best node. At last each follows its image gradient, as Visual-RRT
+does: one Adam step a node, whose child inherits the moments. First all lineages take turns, and
+then the best go on.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ FEWEST_MOVED = 0.2  # share of its joints that a jump moves, at least, on averag
 class LineageNode:
     """What is kept for a node."""
 
-    lineage: jax.Array  # (N,) i32 the one that it belongs to, -1 if none
+    lineage: jax.Array  # (N,) i32 the one that it belongs to
     adam: optax.ScaleByAdamState  # count (N,), mu (N, D), nu (N, D)
     grad: jax.Array  # (N, D) of the loss, where it is known
     has_grad: jax.Array  # (N,) bool
@@ -96,7 +96,7 @@ class LineageRRT:
     def init(
         self, world: World, goal: Goal, q_roots: np.ndarray, capacity: int
     ) -> Tree[LineageNode]:
-        """The start, and other roots; those in collision found no lineage."""
+        """The start, and other roots, in the first lineages; those in collision look worst."""
         return tree_from_roots(world, goal, jnp.asarray(q_roots), capacity)
 
     def goal_score(self, goal: Goal) -> float:
@@ -162,12 +162,12 @@ class LineageRRT:
         parent = jnp.where(valid, tip[lineage], 0)
 
         # An Adam step. Where no gradient is known yet, a child right beside the tip gets one.
-        q, has_grad = tree.q[parent], node.has_grad[parent][:, None]
+        q, has_grad = tree.q[parent], node.has_grad[parent]
         old = jax.tree.map(lambda leaf: leaf[parent], node.adam)
         alpha = self.alpha * (1.0 - old.count / self.steps)
         step, adam = adam_step(world, q, node.grad[parent], old, alpha, self.beta1, self.beta2)
-        adam = jax.tree.map(lambda new, leaf: jnp.where(has_grad[:, 0], new.T, leaf.T).T, adam, old)
-        step = jnp.where(has_grad, step, BESIDE * jax.random.normal(key, step.shape))
+        beside = BESIDE * jax.random.normal(key, step.shape)
+        step, adam = jax.vmap(_one_of)(has_grad, (step, adam), (beside, old))
         return self._proposals(parent, q + step, valid, lineage, adam)
 
     def _in_turn(self, turn: jax.Array) -> jax.Array:
@@ -175,8 +175,8 @@ class LineageRRT:
         return (turn * self.lanes + jnp.arange(self.lanes)) % self.num
 
     def _label(self, tree: Tree[LineageNode]) -> jax.Array:
-        """The lineage (N,) of each node, L for those without one."""
-        return jnp.where(tree.payload.lineage >= 0, tree.payload.lineage, self.num)
+        """The lineage (N,) of each node, L for empty slots."""
+        return jnp.where(trees.occupied(tree), tree.payload.lineage, self.num)
 
     def _best(self, tree: Tree[LineageNode]) -> tuple[jax.Array, jax.Array, jax.Array]:
         """The best node (L,) of each lineage, whether there is one, and its score."""
@@ -232,7 +232,7 @@ class LineageRRT:
         proposals: Proposals,
         expansion: Expansion,
     ) -> Tree[LineageNode]:
-        """Mark parents as exploited, also those whose step was blocked; found the lineages."""
+        """Mark parents as exploited, also those whose step was blocked."""
         # Writes to slot N are dropped: lanes without a step mark nobody.
         stepped = proposals.aux.descends & proposals.valid
         taken = jnp.where(stepped, proposals.parent, tree.capacity)
@@ -243,6 +243,11 @@ class LineageRRT:
     def extract_path(self, tree: Tree[LineageNode]) -> np.ndarray | None:
         """The path (P, D) to the best node, if tree edges join it to the start."""
         return trees.best_path(tree)
+
+
+def _one_of(is_first: jax.Array, first: Any, second: Any) -> Any:
+    """One of two trees of arrays."""
+    return jax.tree.map(lambda a, b: jnp.where(is_first, a, b), first, second)
 
 
 def _losses(world: World, goal: Goal, q: jax.Array) -> jax.Array:
@@ -261,7 +266,7 @@ def tree_from_roots(world: World, goal: Goal, q: jax.Array, capacity: int) -> Tr
     score = _losses(world, goal, q)
     is_free = jax.vmap(world.is_free)(q)
     payload = LineageNode(
-        lineage=jnp.full(len(q), -1, jnp.int32),
+        lineage=jnp.arange(len(q), dtype=jnp.int32),
         adam=fresh_moments(*q.shape),
         grad=jnp.zeros_like(q),
         has_grad=jnp.zeros(len(q), bool),
