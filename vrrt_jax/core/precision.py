@@ -1,7 +1,9 @@
 """All that is computed here is in float32, also where JAX is set to 64 bit."""
 
+import contextlib
+import contextvars
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, ParamSpec, TypeVar
 
 import jax
@@ -10,6 +12,7 @@ import jax.numpy as jnp
 Inputs = ParamSpec("Inputs")
 Output = TypeVar("Output")
 
+_rounds = contextvars.ContextVar("_rounds", default=True)
 _HALF = {"float64": jnp.float32, "int64": jnp.int32, "uint64": jnp.uint32}
 
 
@@ -22,7 +25,7 @@ def single_precision(function: Callable[Inputs, Output]) -> Callable[Inputs, Out
 
     @functools.wraps(function)
     def run(*args: Inputs.args, **kwargs: Inputs.kwargs) -> Output:
-        if jax.dtypes.canonicalize_dtype("float64") == "float32":
+        if not _rounds.get() or jax.dtypes.canonicalize_dtype("float64") == "float32":
             return function(*args, **kwargs)
         rounded: Any = [_rounded(value) for value in args]
         named: Any = {name: _rounded(value) for name, value in kwargs.items()}
@@ -30,6 +33,17 @@ def single_precision(function: Callable[Inputs, Output]) -> Callable[Inputs, Out
             return apply(*rounded, **named)
 
     return run
+
+
+@contextlib.contextmanager
+def double_precision() -> Iterator[None]:
+    """Round nothing meanwhile, and set JAX to 64 bit: to compare derivatives with differences."""
+    token = _rounds.set(False)
+    try:
+        with jax.enable_x64(True):
+            yield
+    finally:
+        _rounds.reset(token)
 
 
 def _rounded(tree: Any) -> Any:

@@ -9,6 +9,7 @@ import pytest
 from splat_cases import IDENTITY, camera_ahead, render_jit, slopes, splats, squares
 
 from vrrt_jax.bench.raster import random_splats
+from vrrt_jax.core.precision import double_precision
 from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.splat.camera import look_at
 from vrrt_jax.splat.raster import render
@@ -34,7 +35,7 @@ def squares_and_gradient(x):
 @pytest.mark.parametrize("size", [(8, 8), (66, 10)])
 def test_gradients_are_those_of_finite_differences(panda, rng, size):
     """By joint positions and by everything a self-model learns."""
-    with jax.enable_x64(True):
+    with double_precision():
         model = jax.tree.map(
             lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a,
             random_splats(panda, 24, rng),
