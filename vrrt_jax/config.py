@@ -85,7 +85,7 @@ class Budget:
     patience: int | None = setting(None, 1, optional=True)
     min_improvement: float = setting(0.0, 0.0)  # an improvement is a loss this much smaller ...
     min_ratio: float = setting(0.97, 0.0, 1.0)  # ... and below this share of the one before
-    attempts: int = setting(2, 1, 1024)  # the later ones with other keys, without a verified path
+    attempts: int = setting(3, 1, 1024)  # the later ones with other keys, without a verified path
     # Of all searches, compilation excluded [s].
     time_limit_s: float = setting(float("inf"), 0.0, endless=True)
     connect_iterations: int = setting(400, 1)  # of RRT-Connect, to a match

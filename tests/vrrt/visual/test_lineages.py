@@ -126,9 +126,9 @@ def test_when_the_young_have_had_their_steps_the_best_go_on(open_world):
     assert sorted(served) == sorted(np.argsort(best, kind="stable")[:32])
 
 
-def test_all_that_grows_hangs_on_the_start_or_on_a_root_that_was_given(wall_world):
+def test_all_that_grows_hangs_on_the_start_or_on_a_root_that_was_given(open_world):
     guess = Q_GOAL + np.float32(0.05)
-    _, trees = grown(wall_world, 14, roots=np.stack([Q_START, guess]))
+    _, trees = grown(open_world, 14, roots=np.stack([Q_START, guess]))
     tree = trees[-1]
     roots = [lineage(tree, node)[0] for node in range(int(tree.size))]
     assert set(roots[2:]) == {0, 1}  # the guess heads the second lineage
