@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.config import PlannerConfig
+from vrrt_jax.core.edges import enforce_bounds
 from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.result import ABORTED, PlanResult, Status, with_time_of
 from vrrt_jax.core.search import make_termination, search
@@ -16,7 +17,7 @@ from vrrt_jax.core.timing import timed
 from vrrt_jax.core.types import ExpansionPolicy, Goal
 from vrrt_jax.outcome import Progress, time_left
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.world import World
+from vrrt_jax.scene.world import World, batch_is_free
 from vrrt_jax.visual import lineages
 from vrrt_jax.visual import policy as published
 from vrrt_jax.visual.finish import finish_visual
@@ -45,7 +46,13 @@ def plan_by_loss(
             if result.status not in RETRYABLE or rest.budget.time_limit_s == 0:
                 break
             key = jax.random.fold_in(key, ATTEMPT_KEY - again)
-            other = attempt(robot, world, problem, policy, roots, key, rest, on_progress)
+            # Where the start is walled in, what its tree does not reach is looked at too.
+            places = roots
+            if isinstance(policy, LineageRRT):
+                room = config.tree.capacity - policy.lanes - len(roots)
+                others = free_around(world, policy, roots[0], key)[:room]
+                places = np.concatenate([roots, others])
+            other = attempt(robot, world, problem, policy, places, key, rest, on_progress)
             if other.status in ABORTED and not other.ok:
                 # It ended before its loss could be compared with the other's.
                 best = dataclasses.replace(result, status=other.status, advice=other.advice)
@@ -53,6 +60,19 @@ def plan_by_loss(
                 best = min(result, other, key=lambda r: (not r.ok, r.loss))
             result = with_time_of(best, result, other)
     return result
+
+
+def free_around(
+    world: World, policy: LineageRRT, q_start: np.ndarray, key: jax.Array
+) -> np.ndarray:
+    """Free configurations (at most L - 2, D) around a start, one for most of the lineages."""
+    key_direction, key_distance = jax.random.split(jax.random.fold_in(key, ATTEMPT_KEY))
+    shape = (8 * policy.num, len(q_start))
+    direction = jax.random.normal(key_direction, shape)
+    direction /= jnp.linalg.norm(direction, axis=1, keepdims=True)
+    distance = policy.radius * jax.random.uniform(key_distance, (shape[0], 1))
+    q = enforce_bounds(world, q_start + distance * direction)
+    return np.asarray(q)[np.asarray(batch_is_free(world, q))][: max(policy.num - 2, 0)]
 
 
 def attempt(
