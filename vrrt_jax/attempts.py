@@ -66,12 +66,9 @@ def free_around(
     world: World, policy: LineageRRT, q_start: np.ndarray, key: jax.Array
 ) -> np.ndarray:
     """Free configurations (at most L - 2, D) around a start, one for most of the lineages."""
-    key_direction, key_distance = jax.random.split(jax.random.fold_in(key, ATTEMPT_KEY))
-    shape = (8 * policy.num, len(q_start))
-    direction = jax.random.normal(key_direction, shape)
-    direction /= jnp.linalg.norm(direction, axis=1, keepdims=True)
-    distance = policy.radius * jax.random.uniform(key_distance, (shape[0], 1))
-    q = enforce_bounds(world, q_start + distance * direction)
+    key = jax.random.fold_in(key, ATTEMPT_KEY)
+    steps = lineages.steps_in_ball(key, 8 * policy.num, len(q_start), policy.radius)
+    q = enforce_bounds(world, jnp.asarray(q_start) + steps)
     return np.asarray(q)[np.asarray(batch_is_free(world, q))][: max(policy.num - 2, 0)]
 
 

@@ -7,7 +7,7 @@ smaller triangles until each lies in a sphere, or is so small that a sphere must
 import numpy as np
 from scipy.spatial import KDTree
 
-from vrrt_jax.robots.convex_parts import Piece, is_inside, split_triangles
+from vrrt_jax.robots.convex_parts import Piece, grow, is_inside, split_triangles
 from vrrt_jax.robots.widest_sphere import MARGIN, best_sphere
 
 _GROUP = 10  # of the bound: side of the cubes in which a cover is proven
@@ -119,21 +119,9 @@ def _grown(
         radii: (n,) [m].
         widest: (n,) [m] no radius may get larger.
     """
-    radii = radii.copy()
     distance = np.where(distance <= widest, distance, np.inf)
     is_out_of_reach = np.asarray(np.isinf(distance).all(axis=1))
-    distance = distance[~is_out_of_reach]
-    while len(distance):
-        # What is farthest from all spheres is taken in by the one that it is nearest to.
-        gap = distance - radii
-        nearest = gap.min(axis=1)
-        worst = nearest.argmax()
-        if nearest[worst] <= 0:
-            break
-        sphere = gap[worst].argmin()
-        radii[sphere] = distance[worst, sphere]
-        distance = distance[nearest > 0]
-    return radii, is_out_of_reach
+    return grow(distance[~is_out_of_reach], radii), is_out_of_reach
 
 
 def _added(

@@ -1,4 +1,4 @@
-"""Adam, whose moments every node of a tree keeps."""
+"""Gradients of many configurations, and Adam, whose moments every node of a tree keeps."""
 
 from typing import Any
 
@@ -7,6 +7,13 @@ import jax.numpy as jnp
 import optax
 
 from vrrt_jax.core.edges import StraightLineEdges
+from vrrt_jax.core.types import Goal
+from vrrt_jax.splat.lanes import map_lanes
+
+
+def losses_and_gradients(world: Any, goal: Goal, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Losses (n,) of configurations (n, D), and their gradients (n, D)."""
+    return map_lanes(jax.value_and_grad(lambda q: goal.loss(world, q)), q)
 
 
 def fresh_moments(num: int, joints: int) -> optax.ScaleByAdamState:

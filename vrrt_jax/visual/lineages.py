@@ -23,7 +23,7 @@ from vrrt_jax.core.edges import num_checks
 from vrrt_jax.core.types import Expansion, Goal, Proposals, Tree, pytree, static
 from vrrt_jax.scene.world import World
 from vrrt_jax.splat.lanes import map_lanes, one_of
-from vrrt_jax.visual.adam import adam_step, fresh_moments
+from vrrt_jax.visual.adam import adam_step, fresh_moments, losses_and_gradients
 
 JUMP_FIRST, JUMP_LAST = 0.8, 0.2  # [rad] standard deviations of a joint that a jump moves
 BESIDE = 1e-3  # [rad] a joint of a child that only repeats its parent with a gradient
@@ -114,15 +114,12 @@ class LineageRRT:
     def _scatter(
         self, world: World, goal: Goal, tree: Tree[LineageNode], key: jax.Array
     ) -> Proposals:
-        """Random edges from the start; their length is uniform, so that near ends are many."""
-        key_direction, key_distance = jax.random.split(key)
-        direction = jax.random.normal(key_direction, (self.lanes, tree.q.shape[1]))
-        direction /= jnp.linalg.norm(direction, axis=1, keepdims=True)
-        distance = self.radius * jax.random.uniform(key_distance, (self.lanes, 1))
+        """Random edges from the start."""
+        step = steps_in_ball(key, self.lanes, tree.q.shape[1], self.radius)
         start = jnp.zeros(self.lanes, jnp.int32)
         every = jnp.ones(self.lanes, bool)
         lineage = self._in_turn(tree.iteration)
-        return self._proposals(start, tree.q[0] + distance * direction, every, lineage)
+        return self._proposals(start, tree.q[0] + step, every, lineage)
 
     def _jump(self, world: World, goal: Goal, tree: Tree[LineageNode], key: jax.Array) -> Proposals:
         """From the best node of each lineage in turn; some joints move, by ever less."""
@@ -212,7 +209,7 @@ class LineageRRT:
         lanes: LineageLanes = proposals.aux
         score, grad = one_of(
             lanes.descends[0],
-            _losses_and_gradients,
+            losses_and_gradients,
             lambda world, goal, q: (_losses(world, goal, q), jnp.zeros_like(q)),
             *(world, goal, q),
         )
@@ -255,9 +252,12 @@ def _losses(world: World, goal: Goal, q: jax.Array) -> jax.Array:
     return map_lanes(lambda q: goal.loss(world, q), q)
 
 
-def _losses_and_gradients(world: World, goal: Goal, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Losses (n,) of configurations (n, D), and their gradients (n, D)."""
-    return map_lanes(jax.value_and_grad(lambda q: goal.loss(world, q)), q)
+def steps_in_ball(key: jax.Array, num: int, joints: int, radius: Any) -> jax.Array:
+    """Random steps (n, D) inside a ball; their length is uniform, so that short ones are many."""
+    key_direction, key_length = jax.random.split(key)
+    direction = jax.random.normal(key_direction, (num, joints))
+    direction /= jnp.linalg.norm(direction, axis=1, keepdims=True)
+    return radius * jax.random.uniform(key_length, (num, 1)) * direction
 
 
 @functools.partial(jax.jit, static_argnums=3)

@@ -20,8 +20,7 @@ from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.rewire import rewire
 from vrrt_jax.core.types import Expansion, Goal, Proposals, Tree, pytree, static
 from vrrt_jax.scene.world import World
-from vrrt_jax.splat.lanes import map_lanes
-from vrrt_jax.visual.adam import adam_step, fresh_moments
+from vrrt_jax.visual.adam import adam_step, fresh_moments, losses_and_gradients
 
 MAX_RANK = 1024  # best nodes that the frontier's law ranks; its weight there is below 1e-40
 
@@ -171,7 +170,7 @@ class VisualRRT:
         self, world: World, goal: Goal, q: jax.Array, proposals: Proposals
     ) -> tuple[jax.Array, VisualNode]:
         """Losses (B,) and payloads of the children."""
-        loss, grad = _losses_and_gradients(world, goal, q)
+        loss, grad = losses_and_gradients(world, goal, q)
         unexploited = jnp.zeros(self.lanes, bool)
         return loss, VisualNode(grad=grad, adam=proposals.aux.adam, exploited=unexploited)
 
@@ -205,15 +204,10 @@ class VisualRRT:
         return trees.best_path(tree)
 
 
-def _losses_and_gradients(world: World, goal: Goal, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Losses (n,) of configurations (n, D), and their gradients (n, D)."""
-    return map_lanes(jax.value_and_grad(lambda q: goal.loss(world, q)), q)
-
-
 @partial(jax.jit, static_argnums=3)
 def tree_from_roots(world: World, goal: Goal, q: jax.Array, capacity: int) -> Tree[VisualNode]:
     """Roots ``q`` (R, D), the start first; those in collision are never expanded."""
-    score, grad = _losses_and_gradients(world, goal, q)
+    score, grad = losses_and_gradients(world, goal, q)
     blocked = ~jax.vmap(world.is_free)(q)
     moments = fresh_moments(*q.shape)
     score = jnp.where(blocked, jnp.finfo(score.dtype).max, score)
