@@ -1,6 +1,7 @@
 """The tree: allocation, insertion, nearest neighbors and the way back to the root."""
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, TypeVar
 
@@ -178,6 +179,46 @@ def with_capacity(tree: Tree[Payload], capacity: int) -> Tree[Payload]:
         cost=padded(tree.cost),
         score=padded(tree.score, jnp.inf),
         payload=jax.tree.map(padded, tree.payload),
+    )
+
+
+def joined(grown: Sequence[Tree[Payload]], roots: int) -> Tree[Payload]:
+    """One tree of several of the same capacity that grew from the same roots; on the host.
+
+    Args:
+        grown: the trees.
+        roots: how many of their first nodes are their roots.
+    """
+    first = grown[0]
+    sizes = [int(tree.size) for tree in grown]
+    more = [size - roots for size in sizes]  # nodes besides the roots
+    begin = roots + np.cumsum([0, *more[:-1]])  # where those of each tree go
+    capacity = first.capacity * len(grown)
+
+    def joined_column(*columns: jax.Array, fill: Any = 0) -> jax.Array:
+        rows = [np.asarray(columns[0])[:roots]]
+        rows += [
+            np.asarray(column)[roots:size] for column, size in zip(columns, sizes, strict=True)
+        ]
+        whole = np.concatenate(rows)
+        width = [(0, capacity - len(whole)), *[(0, 0)] * (whole.ndim - 1)]
+        return jnp.asarray(np.pad(whole, width, constant_values=fill))
+
+    parents = [
+        np.where(np.asarray(tree.parent) < roots, tree.parent, tree.parent - roots + place)
+        for tree, place in zip(grown, begin, strict=True)
+    ]
+    return dataclasses.replace(
+        first,
+        q=joined_column(*(tree.q for tree in grown)),
+        parent=joined_column(*parents, fill=-1),
+        cost=joined_column(*(tree.cost for tree in grown)),
+        score=joined_column(*(tree.score for tree in grown), fill=np.inf),
+        size=jnp.int32(roots + sum(more)),
+        iteration=sum(tree.iteration for tree in grown),
+        rejected=sum(tree.rejected for tree in grown),
+        checked=sum(tree.checked for tree in grown),
+        payload=jax.tree.map(joined_column, *(tree.payload for tree in grown)),
     )
 
 
