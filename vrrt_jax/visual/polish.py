@@ -4,9 +4,10 @@ Many configurations look nearly like the goal: half a turn of a gripper, another
 makes up for another. Each is a local minimum of the loss, which gradients do not leave. So samples
 spread widely around the best nodes of a search, with some joints moved and others not, and all
 descend by Levenberg-Marquardt, for which with few joints forward renders suffice. The distinct ends
-start the next round. The last of them descend on a larger image with more splats, which tells what
-the small one does not, and then on a close-up of the hand beside it, where half a turn becomes
-visible. What no image tells stays near the start: a weak prior sees to that.
+start the next round. Where none matches, the outer joints are drawn anew: the image tells them
+last. The last ends descend on a larger image with more splats, which tells what the small one does
+not, and then on a close-up of the hand beside it, where half a turn becomes visible. What no image
+tells stays near the start: a weak prior sees to that.
 """
 
 import dataclasses
@@ -29,6 +30,7 @@ from vrrt_jax.splat.lanes import map_lanes
 from vrrt_jax.splat.types import Camera, SplatModel
 from vrrt_jax.visual.distinct import distinct
 from vrrt_jax.visual.goal import CloseUp
+from vrrt_jax.visual.polish_samples import last_hinge, redraw_outer, sample_around
 from vrrt_jax.visual.twins import twins
 
 LINEARIZE_BATCH = 4  # configurations in one call: with their differences, a batch of renders
@@ -38,7 +40,7 @@ FD_STEP = 2e-4  # [rad] step of the finite differences; longer ones lose the wea
 LEAST_TOLD = 1e-3  # of a threshold per rad^2; joints that raise the loss by less are not told
 RIDGE = 1e-7  # keeps joints that no pixel sees where they are
 MAX_STEP = 0.3  # [rad] of one step of a joint
-FEWEST_MOVED = 0.2  # share of its joints that a sample moves, at least, on average
+LATE_SAMPLES = 4  # times as many, where nothing matches
 TWINNED = 2  # best ends whose kinematic twins are looked at
 TURNS = 12  # in which the last joint goes all the way round
 SPREAD_DECAY = 0.5  # how far samples spread in a round, in units of the round before
@@ -102,12 +104,18 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
     rng = np.random.default_rng(seed)
     config, coarse, fine = polishing.config, polishing.coarse, polishing.fine
 
-    # Rounds on the coarse image: sample, keep the best, descend, keep distinct ends.
+    # Rounds on the coarse image: sample, keep the best, descend, keep distinct ends. Where nothing
+    # matches after all rounds, there are as many again, with more samples.
     for k in range(2 * config.rounds):
-        spread = config.spread * SPREAD_DECAY ** min(k, config.rounds - 1)
-        samples = _sample_around(q, _last_hinge(world), config.samples, spread, rng)
+        if k < config.rounds:
+            num, lanes, spread = config.samples, config.lanes, config.spread * SPREAD_DECAY**k
+            samples = sample_around(q, last_hinge(world), num, spread, rng)
+        else:
+            num, lanes = LATE_SAMPLES * config.samples // 2, 2 * config.lanes
+            around = sample_around(q, last_hinge(world), num, config.spread, rng)
+            samples = np.concatenate([around, redraw_outer(world, q, num, rng)])
         cost = _in_batches(evaluate_cost, world, coarse, samples, EVALUATE_BATCH)[0]
-        best = samples[np.argsort(cost, kind="stable")[: config.lanes]]
+        best = samples[np.argsort(cost, kind="stable")[:lanes]]
         ends = _descend(lambda q: _linearize(world, coarse, q), best, config.steps)
         kept = _distinct_ends(world, ends, config.kept)
         q = kept.q
@@ -116,7 +124,7 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
             break
 
     # The fine image, from every minimum over a whole turn of the last joint.
-    turned = _turns_of_last_hinge(world, fine, q, config.kept)
+    turned = _turns_oflast_hinge(world, fine, q, config.kept)
     ends = _descend(lambda q: _linearize(world, fine, q), turned, config.steps)
     kept = _with_twins(world, fine, _distinct_ends(world, ends, config.kept), config)
     loss = kept.loss
@@ -171,34 +179,14 @@ def _distinct_ends(world: World, model: _GaussNewtonModel, num: int) -> _GaussNe
     return _GaussNewtonModel(*(column[rows] for column in model))
 
 
-def _last_hinge(world: World) -> int:
-    """The joint that turns the hand, behind which there may be sliding fingers."""
-    hinges = np.flatnonzero(~np.any(np.asarray(world.chain.slide), axis=(1, 2)))
-    return int(hinges[-1]) if len(hinges) else -1
-
-
-def _sample_around(
-    q: np.ndarray, hinge: int, num: int, spread: float, rng: np.random.Generator
-) -> np.ndarray:
-    """Samples (num, D) around configurations (H, D), which are the first of them."""
-    # Grippers look alike after half a turn of the last joint.
-    turned = q.copy()
-    turned[:, hinge] += np.where(q[:, hinge] > 0, -np.pi, np.pi)
-    # Each sample moves a random share of its joints.
-    shape = (-(-num // len(q)), *q.shape)
-    moved = rng.uniform(size=shape) < rng.uniform(FEWEST_MOVED, 1.0, (*shape[:2], 1))
-    around = q + spread * moved * rng.normal(size=shape)
-    return np.concatenate([q, turned, around.reshape(-1, q.shape[1])])[:num]
-
-
-def _turns_of_last_hinge(world: World, goal: PriorGoal, q: np.ndarray, num: int) -> np.ndarray:
+def _turns_oflast_hinge(world: World, goal: PriorGoal, q: np.ndarray, num: int) -> np.ndarray:
     """The best (at most num, D) of configurations (H, D) and their minima over the last joint.
 
     Its turn is what images tell least: a gripper spins about its axis and hardly changes.
     """
     joints = q.shape[1]
     turn = 2 * np.pi / TURNS * np.arange(TURNS)
-    around = (q[:, None] + turn[:, None] * np.eye(joints)[_last_hinge(world)]).reshape(-1, joints)
+    around = (q[:, None] + turn[:, None] * np.eye(joints)[last_hinge(world)]).reshape(-1, joints)
     cost = _in_batches(evaluate_cost, world, goal, around, EVALUATE_BATCH)[0].reshape(-1, TURNS)
     # A turn is a minimum if both of its neighbors cost more; no turn at all is always one.
     is_minimum = (cost < np.roll(cost, 1, axis=1)) & (cost <= np.roll(cost, -1, axis=1))

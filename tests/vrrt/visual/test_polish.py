@@ -15,6 +15,7 @@ from vrrt_jax.visual.polish import (
     linearize,
     polish,
 )
+from vrrt_jax.visual.polish_samples import redraw_outer
 from vrrt_jax.visual.problem import make_problem
 
 
@@ -77,3 +78,12 @@ def test_uncertainty_is_how_far_a_joint_goes_before_the_loss_has_risen_by_the_th
     partner = -3.8 / 4.0 * off[0]  # where the second joint follows as it likes best
     moved = np.array([off[0], partner, 0.0])
     assert moved @ matrix[0] @ moved == pytest.approx(0.01, rel=1e-3)
+
+
+def test_outer_joints_are_drawn_anew(panda, open_world, rng):
+    q = np.stack([panda.home, panda.home + 0.1]).astype(np.float32)
+    samples = redraw_outer(open_world, q, 400, rng)
+    near = np.abs(samples - np.resize(q, samples.shape)) < 0.3
+    # The first joint always stays, the last never, and those in between more rarely the farther out.
+    share = near.mean(axis=0)
+    assert share[0] == 1.0 and np.all(np.diff(share) < 0.05) and share[-1] < 0.3

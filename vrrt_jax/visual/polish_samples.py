@@ -1,0 +1,41 @@
+"""Samples around the best configurations of a search, from which polishing descends."""
+
+import numpy as np
+
+from vrrt_jax.scene.world import World
+
+FEWEST_MOVED = 0.2  # share of its joints that a sample moves, at least, on average
+INNER_SPREAD = 0.05  # [rad] of joints that are not drawn anew
+
+
+def last_hinge(world: World) -> int:
+    """The joint that turns the hand, behind which there may be sliding fingers."""
+    hinges = np.flatnonzero(~np.any(np.asarray(world.chain.slide), axis=(1, 2)))
+    return int(hinges[-1]) if len(hinges) else -1
+
+
+def sample_around(
+    q: np.ndarray, hinge: int, num: int, spread: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Samples (num, D) around configurations (H, D), which are the first of them."""
+    # Grippers look alike after half a turn of the last joint.
+    turned = q.copy()
+    turned[:, hinge] += np.where(q[:, hinge] > 0, -np.pi, np.pi)
+    # Each sample moves a random share of its joints.
+    shape = (-(-num // len(q)), *q.shape)
+    moved = rng.uniform(size=shape) < rng.uniform(FEWEST_MOVED, 1.0, (*shape[:2], 1))
+    around = q + spread * moved * rng.normal(size=shape)
+    return np.concatenate([q, turned, around.reshape(-1, q.shape[1])])[:num]
+
+
+def redraw_outer(world: World, q: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:
+    """Samples (num, D): configurations (H, D), of which all joints from one on are drawn anew.
+
+    The outer joints show least, so they are wrong most often. Where the inner ones are right, they
+    are few numbers, which random changes of any joints seldom hit.
+    """
+    joints = q.shape[1]
+    anew = rng.uniform(np.asarray(world.lower), np.asarray(world.upper), (num, joints))
+    is_redrawn = np.arange(joints) >= rng.integers(1, joints, (num, 1))
+    kept = np.resize(q, (num, joints))
+    return np.where(is_redrawn, anew, kept + INNER_SPREAD * rng.normal(size=kept.shape))
