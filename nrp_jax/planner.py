@@ -12,6 +12,7 @@ import numpy as np
 from nrp_jax.config import EDGE_STEPS, PlannerConfig
 from nrp_jax.homes.grid import Grid
 from nrp_jax.planners.nrp import NeuralRRT
+from nrp_jax.planners.nrp_connect import NRPConnect, search_connect
 from nrp_jax.samplers import check_fits, load_sampler
 from nrp_jax.scene.configurations import check_configuration
 from nrp_jax.scene.exact import ExactScene, verify
@@ -31,8 +32,9 @@ from vrrt_jax.core.search import SearchResult, make_termination, no_search, sear
 from vrrt_jax.core.settings import check_settings
 from vrrt_jax.core.types import ExpansionPolicy
 
-PLANNERS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g")
-KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae"}  # of the samplers that planners need
+PLANNERS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g", "nrp-connect")
+# Of the samplers that planners need.
+KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae", "nrp-connect": "cvae"}
 ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
 ADVICE = {
     Status.SOLVED: "",
@@ -77,8 +79,8 @@ def plan(
         planner: one of :data:`PLANNERS`, or a policy of the kernel, see
             :class:`~vrrt_jax.core.types.ExpansionPolicy`.
         method: another word for ``planner``.
-        sampler: what proposes waypoints to "nrp-d" and "nrp-g": a pytree with ``propose(world,
-            q_from, q_goal, key)``; the packaged weights by default.
+        sampler: what proposes waypoints to "nrp-d", "nrp-g" and "nrp-connect": a pytree with
+            ``propose(world, q_from, q_goal, key)``; the packaged weights by default.
         world: of this robot and grid, to save building it again; its ``is_free`` is obeyed.
         scene: the exact scene of this robot and grid, to save building it again.
         config: settings, the default ones if None.
@@ -120,7 +122,8 @@ def plan(
             if attempt and (config.max_expansions - tried < policy.lanes or left_s <= 0):
                 break
             iterations = max((config.max_expansions - tried) // policy.lanes, 1)
-            found = search(
+            grow = search_connect if isinstance(policy, NRPConnect) else search
+            found = grow(
                 world,
                 goal,
                 policy,
@@ -227,8 +230,13 @@ def _policy(
     shape = {"keep_partial": True, "lanes": config.lanes, "edge_steps": EDGE_STEPS}
     if planner in ("rrt", "rrt-is"):
         return RRT(goal_bias=bias, intermediate=planner == "rrt-is", **shape)
-    sampler = load_sampler(robot.name, KINDS[planner]) if sampler is None else sampler
+    if sampler is None:
+        # Two trees check the edges to waypoints themselves, and keep the free parts of them.
+        checked = {"num_edge_checked": 1} if planner == "nrp-connect" else {}
+        sampler = load_sampler(robot.name, KINDS[planner], **checked)
     check_fits(sampler, robot, world, KINDS[planner])
+    if planner == "nrp-connect":
+        return NRPConnect(sampler=sampler, lanes=max(config.lanes, 2))
     rate = jnp.float32(config.straight_rate)
     return NeuralRRT(goal_bias=bias, sampler=sampler, straight_rate=rate, **shape)
 
