@@ -13,6 +13,7 @@ from nrp_jax.config import EDGE_STEPS, PlannerConfig
 from nrp_jax.homes.grid import Grid
 from nrp_jax.planners.nrp import NeuralRRT
 from nrp_jax.planners.nrp_connect import NRPConnect, search_connect
+from nrp_jax.planners.restarts import search_with_restarts
 from nrp_jax.samplers import check_fits, load_sampler
 from nrp_jax.scene.configurations import check_configuration
 from nrp_jax.scene.exact import ExactScene, verify
@@ -32,9 +33,15 @@ from vrrt_jax.core.search import SearchResult, make_termination, no_search, sear
 from vrrt_jax.core.settings import check_settings
 from vrrt_jax.core.types import ExpansionPolicy
 
-PLANNERS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g", "nrp-connect")
+PLANNERS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g", "nrp-connect", "nrp-star-connect")
 # Of the samplers that planners need.
-KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae", "nrp-connect": "cvae"}
+KINDS = {
+    "nrp-d": "discriminator",
+    "nrp-g": "cvae",
+    "nrp-connect": "cvae",
+    "nrp-star-connect": "cvae",
+}
+CONNECT = ("nrp-connect", "nrp-star-connect")
 ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
 ADVICE = {
     Status.SOLVED: "",
@@ -122,8 +129,8 @@ def plan(
             if attempt and (config.max_expansions - tried < policy.lanes or left_s <= 0):
                 break
             iterations = max((config.max_expansions - tried) // policy.lanes, 1)
-            grow = search_connect if isinstance(policy, NRPConnect) else search
-            found = grow(
+            found, path = _searched(
+                planner,
                 world,
                 goal,
                 policy,
@@ -134,7 +141,6 @@ def plan(
                 max_capacity=config.max_capacity,
                 on_progress=on_progress,
             )
-            path = policy.extract_path(found.tree)
             check_extracted_path(policy, path, np.asarray(start))
             raw = np.asarray(start)[None] if path is None else path
             results.append(_finish(scene, world, places, goal, raw, found, key))
@@ -154,6 +160,17 @@ def plan(
         rejected=dict(rejected),
     )
     return _moved(result, places)
+
+
+def _searched(
+    planner: str | ExpansionPolicy, world: GridWorld, goal: Any, policy: Any, tree: Any, **options
+) -> tuple[SearchResult, np.ndarray | None]:
+    """What a planner finds, and the path (P, D) if there is one."""
+    if planner == "nrp-star-connect":
+        return search_with_restarts(world, goal, policy, tree, **options)
+    grow = search_connect if isinstance(policy, NRPConnect) else search
+    found = grow(world, goal, policy, tree, **options)
+    return found, policy.extract_path(found.tree)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -232,10 +249,10 @@ def _policy(
         return RRT(goal_bias=bias, intermediate=planner == "rrt-is", **shape)
     if sampler is None:
         # Two trees check the edges to waypoints themselves, and keep the free parts of them.
-        checked = {"num_edge_checked": 1} if planner == "nrp-connect" else {}
+        checked = {"num_edge_checked": 1} if planner in CONNECT else {}
         sampler = load_sampler(robot.name, KINDS[planner], **checked)
     check_fits(sampler, robot, world, KINDS[planner])
-    if planner == "nrp-connect":
+    if planner in CONNECT:
         return NRPConnect(sampler=sampler, lanes=max(config.lanes, 2))
     rate = jnp.float32(config.straight_rate)
     return NeuralRRT(goal_bias=bias, sampler=sampler, straight_rate=rate, **shape)
