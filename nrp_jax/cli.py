@@ -47,8 +47,7 @@ def _add_plan(commands) -> None:
     plan.add_argument("--goal", type=command.numbers, help="as --goal=...")
     plan.add_argument(
         "--method",
-        default="rrt-connect",
-        help="rrt, rrt-is, rrt-connect, nrp-d, nrp-g or nrp-connect",
+        help="rrt, rrt-is, rrt-connect, nrp-d, nrp-g, nrp-connect (default) or nrp-star-connect",
     )
     plan.add_argument("--model", help="what nrp train wrote; packaged weights by default")
     plan.add_argument("--crop", type=command.numbers, help="plan in x0,y0,x1,y1 of the map [m]")
@@ -71,27 +70,29 @@ def _plan(arguments: argparse.Namespace) -> int:
     import jax
 
     from nrp_jax.planner import KINDS, plan
+    from nrp_jax.planners.nrp_connect import default_planner
     from nrp_jax.samplers import load_sampler
     from nrp_jax.scene.world import build_world
 
     problem = _problem(arguments)
     robot, grid = problem.robot, problem.grid
+    world = build_world(robot, grid, resolution=arguments.resolution)
+    method = arguments.method or default_planner(robot, world)
     sampler = None
     if arguments.model is not None:
-        if arguments.method not in KINDS:
+        if method not in KINDS:
             raise ValueError(
-                f"method '{arguments.method}' uses no model; drop --model, or choose a method of "
+                f"method '{method}' uses no model; drop --model, or choose a method of "
                 f"{', '.join(KINDS)}"
             )
-        sampler = load_sampler(robot.name, KINDS[arguments.method], arguments.model)
-    world = build_world(robot, grid, resolution=arguments.resolution)
+        sampler = load_sampler(robot.name, KINDS[method], arguments.model)
     result = plan(
         robot,
         grid,
         problem.q_start,
         problem.q_goal,
         key=jax.random.key(arguments.seed),
-        planner=arguments.method,
+        planner=method,
         sampler=sampler,
         world=world,
         max_expansions=arguments.max_expansions,
@@ -99,7 +100,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         time_limit_s=arguments.time_limit,
     )
     print(result)
-    out, record = Path(arguments.out), _record(problem, arguments, result)
+    out, record = Path(arguments.out), _record(problem, method, arguments.seed, result)
     with command.or_printed(lambda: json.dumps(record)), replacing(out / "path.json", "w") as file:
         file.write(json.dumps(record, indent=1))
     if not arguments.no_pictures:
@@ -154,13 +155,13 @@ def _problem(arguments: argparse.Namespace):
     )
 
 
-def _record(problem, arguments: argparse.Namespace, result) -> dict:
+def _record(problem, method: str, seed: int, result) -> dict:
     """What ``path.json`` holds."""
     return {
         "robot": problem.robot.name,
         "map": str(problem.map_file),
-        "method": arguments.method,
-        "seed": arguments.seed,
+        "method": method,
+        "seed": seed,
         "status": result.status.name,
         "refused": result.refused,
         "verified": bool(result.verification and result.verification.ok),

@@ -12,7 +12,12 @@ import numpy as np
 from nrp_jax.config import EDGE_STEPS, PlannerConfig
 from nrp_jax.homes.grid import Grid
 from nrp_jax.planners.nrp import NeuralRRT
-from nrp_jax.planners.nrp_connect import NRPConnect, search_connect
+from nrp_jax.planners.nrp_connect import (
+    NRPConnect,
+    default_planner,
+    packaged_sampler,
+    search_connect,
+)
 from nrp_jax.planners.restarts import search_with_restarts
 from nrp_jax.samplers import check_fits, load_sampler
 from nrp_jax.scene.configurations import check_configuration
@@ -33,15 +38,10 @@ from vrrt_jax.core.search import SearchResult, make_termination, no_search, sear
 from vrrt_jax.core.settings import check_settings
 from vrrt_jax.core.types import ExpansionPolicy
 
-PLANNERS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g", "nrp-connect", "nrp-star-connect")
-# Of the samplers that planners need.
-KINDS = {
-    "nrp-d": "discriminator",
-    "nrp-g": "cvae",
-    "nrp-connect": "cvae",
-    "nrp-star-connect": "cvae",
-}
 CONNECT = ("nrp-connect", "nrp-star-connect")
+PLANNERS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g", *CONNECT)
+# Of the samplers that planners need.
+KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae", **dict.fromkeys(CONNECT, "cvae")}
 ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
 ADVICE = {
     Status.SOLVED: "",
@@ -63,7 +63,7 @@ def plan(
     q_goal: np.ndarray | ConfigurationGoal,
     *,
     key: jax.Array,
-    planner: str | ExpansionPolicy = "rrt-connect",
+    planner: str | ExpansionPolicy | None = None,
     method: str | None = None,
     sampler: Any = None,
     world: GridWorld | None = None,
@@ -84,7 +84,8 @@ def plan(
         q_goal: (D,) configuration, or a goal that holds one.
         key: random key; the same key gives the same plan on the same machine, unless time ends it.
         planner: one of :data:`PLANNERS`, or a policy of the kernel, see
-            :class:`~vrrt_jax.core.types.ExpansionPolicy`.
+            :class:`~vrrt_jax.core.types.ExpansionPolicy`. By default "nrp-connect" where the
+            packaged networks fit robot and map, otherwise "rrt-connect".
         method: another word for ``planner``.
         sampler: what proposes waypoints to "nrp-d", "nrp-g" and "nrp-connect": a pytree with
             ``propose(world, q_from, q_goal, key)``; the packaged weights by default.
@@ -101,6 +102,7 @@ def plan(
     config = _config(config, settings)
     planner = _planner(planner, method)
     world = build_world(robot, grid) if world is None else world
+    planner = default_planner(robot, world) if planner is None else planner
     q_start = check_configuration(robot, world, q_start, "start")
     goal = q_goal if isinstance(q_goal, ConfigurationGoal) else ConfigurationGoal(q=q_goal)
     q_goal = check_configuration(robot, world, goal.q, "goal")
@@ -199,19 +201,21 @@ def _moved(result: PlanResult, places: _Places) -> PlanResult:
     return dataclasses.replace(result, tree=tree, **paths, **ends)
 
 
-def _planner(planner: str | ExpansionPolicy, method: str | None) -> str | ExpansionPolicy:
-    """The planner that is asked for.
+def _planner(
+    planner: str | ExpansionPolicy | None, method: str | None
+) -> str | ExpansionPolicy | None:
+    """The planner that is asked for, None for the default.
 
     Raises:
         ValueError: two are, the name is unknown, or the object is no policy.
     """
     if method is not None:
-        if planner != "rrt-connect":
+        if planner is not None:
             raise ValueError("got both planner and method; expected one of them")
         planner = method
-    if not isinstance(planner, str):
+    if planner is not None and not isinstance(planner, str):
         check_policy(planner)
-    elif planner not in PLANNERS:
+    elif planner not in (None, *PLANNERS):
         raise ValueError(f"unknown planner '{planner}'; have: {', '.join(PLANNERS)}")
     return planner
 
@@ -247,10 +251,9 @@ def _policy(
     shape = {"keep_partial": True, "lanes": config.lanes, "edge_steps": EDGE_STEPS}
     if planner in ("rrt", "rrt-is"):
         return RRT(goal_bias=bias, intermediate=planner == "rrt-is", **shape)
-    if sampler is None:
-        # Two trees check the edges to waypoints themselves, and keep the free parts of them.
-        checked = {"num_edge_checked": 1} if planner in CONNECT else {}
-        sampler = load_sampler(robot.name, KINDS[planner], **checked)
+    if sampler is None and planner in CONNECT:
+        sampler = packaged_sampler(robot.name)
+    sampler = load_sampler(robot.name, KINDS[planner]) if sampler is None else sampler
     check_fits(sampler, robot, world, KINDS[planner])
     if planner in CONNECT:
         return NRPConnect(sampler=sampler, lanes=max(config.lanes, 2))

@@ -1,12 +1,14 @@
 """NRP-Connect: two trees that grow towards each other, with learned waypoints where it is hard."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
 import numpy as np
 
-from nrp_jax.samplers import proposed
+from nrp_jax.samplers import CVAESampler, check_fits, load_sampler, proposed
+from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners.rrt_connect import ConnectNode, RRTConnect
@@ -104,3 +106,25 @@ def search_connect(
         compile_s=first.compile_s + then.compile_s,
         search_s=first.search_s + then.search_s,
     )
+
+
+@functools.cache
+def packaged_sampler(task: str) -> CVAESampler:
+    """The packaged CVAE of a robot, read once.
+
+    The trees check the edges to waypoints themselves, and keep the free parts of them: the sampler
+    proposes one a lane, without a check.
+
+    Raises:
+        ValueError: there is none for such a robot.
+    """
+    return load_sampler(task, "cvae", num_edge_checked=1)
+
+
+def default_planner(robot: MobileRobot, world: GridWorld) -> str:
+    """Name "nrp-connect" where the packaged networks fit robot and map, else "rrt-connect"."""
+    try:
+        check_fits(packaged_sampler(robot.name), robot, world, "cvae")
+    except ValueError:
+        return "rrt-connect"
+    return "nrp-connect"

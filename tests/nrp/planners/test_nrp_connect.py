@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import nrp_jax
-from nrp_jax.planners.nrp_connect import NRPConnect, search_connect
+from nrp_jax.planners.nrp_connect import NRPConnect, default_planner, search_connect
 from vrrt_jax.core.planners import RRTConnect
 from vrrt_jax.core.search import StopReason, make_termination
 from vrrt_jax.core.types import pytree
@@ -108,3 +108,10 @@ def test_only_lanes_that_extend_go_to_waypoints(world):
     np.testing.assert_array_equal(learned.target[:4], np.broadcast_to(DOOR, (4, 8)))
     np.testing.assert_array_equal(learned.target[4:], straight.target[4:])
     assert np.asarray(straight.aux.connects)[4:].sum() == 2  # the two roots
+
+
+def test_the_default_is_what_the_packaged_networks_fit(world):
+    snake = nrp_jax.load_robot("snake")
+    fine = nrp_jax.Grid(occupied=np.zeros((50, 40), bool), resolution=0.05)
+    assert default_planner(snake, world) == "nrp-connect"
+    assert default_planner(snake, nrp_jax.build_world(snake, fine)) == "rrt-connect"
