@@ -69,8 +69,8 @@ def _add_plan(commands) -> None:
 def _plan(arguments: argparse.Namespace) -> int:
     import jax
 
-    from nrp_jax.planner import KINDS, plan
-    from nrp_jax.planners.nrp_connect import default_planner
+    from nrp_jax.planner import CONNECT, KINDS, plan
+    from nrp_jax.planners.nrp_connect import UNCHECKED, default_planner
     from nrp_jax.samplers import load_sampler
     from nrp_jax.scene.world import build_world
 
@@ -85,7 +85,8 @@ def _plan(arguments: argparse.Namespace) -> int:
                 f"method '{method}' uses no model; drop --model, or choose a method of "
                 f"{', '.join(KINDS)}"
             )
-        sampler = load_sampler(robot.name, KINDS[method], arguments.model)
+        settings = UNCHECKED if method in CONNECT else {}
+        sampler = load_sampler(robot.name, KINDS[method], arguments.model, **settings)
     result = plan(
         robot,
         grid,

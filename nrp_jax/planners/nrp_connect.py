@@ -15,6 +15,10 @@ from vrrt_jax.core.planners.rrt_connect import ConnectNode, RRTConnect
 from vrrt_jax.core.search import SearchResult, StopReason, Termination, search
 from vrrt_jax.core.types import Proposals, Tree, pytree, static
 
+# The trees check the edges to waypoints themselves, and keep the free parts of them: the sampler
+# proposes one a lane, without a check.
+UNCHECKED = {"num_edge_checked": 1}
+
 
 @pytree
 class NRPConnect(RRTConnect):
@@ -110,15 +114,12 @@ def search_connect(
 
 @functools.cache
 def packaged_sampler(task: str) -> CVAESampler:
-    """The packaged CVAE of a robot, read once.
-
-    The trees check the edges to waypoints themselves, and keep the free parts of them: the sampler
-    proposes one a lane, without a check.
+    """The packaged CVAE of a robot, for two trees; read once.
 
     Raises:
         ValueError: there is none for such a robot.
     """
-    return load_sampler(task, "cvae", num_edge_checked=1)
+    return load_sampler(task, "cvae", **UNCHECKED)
 
 
 def default_planner(robot: MobileRobot, world: GridWorld) -> str:
