@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from nrp_jax.samplers import CVAESampler, check_fits, load_sampler, proposed
+from nrp_jax.samplers import Sampler, check_fits, load_sampler, proposed
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.goal import ConfigurationGoal
@@ -17,7 +17,7 @@ from vrrt_jax.core.types import Proposals, Tree, pytree, static
 
 # The trees check the edges to waypoints themselves, and keep the free parts of them: the sampler
 # proposes one a lane, without a check.
-UNCHECKED = {"num_edge_checked": 1}
+UNCHECKED: dict[str, Any] = {"num_edge_checked": 1}
 
 
 @pytree
@@ -113,7 +113,7 @@ def search_connect(
 
 
 @functools.cache
-def packaged_sampler(task: str) -> CVAESampler:
+def packaged_sampler(task: str) -> Sampler:
     """The packaged CVAE of a robot, for two trees; read once.
 
     Raises:
