@@ -38,12 +38,16 @@ def _parser() -> argparse.ArgumentParser:
 def _add_plan(commands) -> None:
     plan = commands.add_parser("plan", help="plan between two configurations in a home")
     plan.set_defaults(run=_plan)
-    plan.add_argument("--map", required=True, help=".npz, ROS .yaml or MJCF .xml")
-    plan.add_argument("--robot", default="snake", help="snake or fetch")
-    plan.add_argument("--start", type=command.numbers, required=True, help="as --start=1,2.5,0,...")
-    plan.add_argument("--goal", type=command.numbers, required=True, help="as --goal=...")
     plan.add_argument(
-        "--method", default="rrt-connect", help="rrt, rrt-is, rrt-connect, nrp-d or nrp-g"
+        "--problem", help="home_1, home_fetch, or a folder; instead of robot, map, start and goal"
+    )
+    plan.add_argument("--map", help=".npz, ROS .yaml or MJCF .xml")
+    plan.add_argument("--robot", help="snake or fetch; snake by default")
+    plan.add_argument("--start", type=command.numbers, help="as --start=1,2.5,0,...")
+    plan.add_argument("--goal", type=command.numbers, help="as --goal=...")
+    plan.add_argument(
+        "--method",
+        help="rrt, rrt-is, rrt-connect, nrp-d, nrp-g, nrp-connect (default) or nrp-star-connect",
     )
     plan.add_argument("--model", help="what nrp train wrote; packaged weights by default")
     plan.add_argument("--crop", type=command.numbers, help="plan in x0,y0,x1,y1 of the map [m]")
@@ -65,35 +69,31 @@ def _add_plan(commands) -> None:
 def _plan(arguments: argparse.Namespace) -> int:
     import jax
 
-    from nrp_jax.homes.grid import load_map
-    from nrp_jax.planner import KINDS, plan
+    from nrp_jax.planner import CONNECT, KINDS, plan
+    from nrp_jax.planners.nrp_connect import UNCHECKED, default_planner
     from nrp_jax.samplers import load_sampler
-    from nrp_jax.scene.configurations import check_shape
-    from nrp_jax.scene.robots import load_robot
     from nrp_jax.scene.world import build_world
 
-    robot = load_robot(arguments.robot)
-    for name in ("start", "goal"):
-        check_shape(robot, getattr(arguments, name), name)
-    if arguments.crop is not None and len(arguments.crop) != 4:
-        raise ValueError(f"--crop has {len(arguments.crop)} numbers; expected x0,y0,x1,y1")
-    grid = load_map(arguments.map, crop=arguments.crop)
+    problem = _problem(arguments)
+    robot, grid = problem.robot, problem.grid
+    world = build_world(robot, grid, resolution=arguments.resolution)
+    method = arguments.method or default_planner(robot, world)
     sampler = None
     if arguments.model is not None:
-        if arguments.method not in KINDS:
+        if method not in KINDS:
             raise ValueError(
-                f"method '{arguments.method}' uses no model; drop --model, or choose a method of "
+                f"method '{method}' uses no model; drop --model, or choose a method of "
                 f"{', '.join(KINDS)}"
             )
-        sampler = load_sampler(robot.name, KINDS[arguments.method], arguments.model)
-    world = build_world(robot, grid, resolution=arguments.resolution)
+        settings = UNCHECKED if method in CONNECT else {}
+        sampler = load_sampler(robot.name, KINDS[method], arguments.model, **settings)
     result = plan(
         robot,
         grid,
-        arguments.start,
-        arguments.goal,
+        problem.q_start,
+        problem.q_goal,
         key=jax.random.key(arguments.seed),
-        planner=arguments.method,
+        planner=method,
         sampler=sampler,
         world=world,
         max_expansions=arguments.max_expansions,
@@ -101,14 +101,14 @@ def _plan(arguments: argparse.Namespace) -> int:
         time_limit_s=arguments.time_limit,
     )
     print(result)
-    out, record = Path(arguments.out), _record(robot.name, arguments, result)
+    out, record = Path(arguments.out), _record(problem, method, arguments.seed, result)
     with command.or_printed(lambda: json.dumps(record)), replacing(out / "path.json", "w") as file:
         file.write(json.dumps(record, indent=1))
     if not arguments.no_pictures:
         from nrp_jax.viz import save_plan
 
         try:
-            save_plan(out / "plan.png", robot, grid, world, result, arguments.goal)
+            save_plan(out / "plan.png", robot, grid, world, result, problem.q_goal)
         except ModuleNotFoundError:
             print("no figure: matplotlib is missing; pip install 'vrrt-jax[plot]'", file=sys.stderr)
     if not result.ok:
@@ -120,13 +120,49 @@ def _plan(arguments: argparse.Namespace) -> int:
     return EXIT_SOLVED if result.ok else EXIT_UNSOLVED
 
 
-def _record(robot: str, arguments: argparse.Namespace, result) -> dict:
+def _problem(arguments: argparse.Namespace):
+    """The problem that is asked for: a packaged one, a folder, or put together of options.
+
+    Raises:
+        ValueError: an option is missing, or two say the same.
+    """
+    from nrp_jax.homes.grid import load_map
+    from nrp_jax.problems import Problem, load_problem, problem_names
+    from nrp_jax.scene.configurations import check_shape
+    from nrp_jax.scene.robots import load_robot
+
+    own = ("map", "robot", "start", "goal", "crop")
+    if arguments.problem is not None:
+        if given := [name for name in own if getattr(arguments, name) is not None]:
+            raise ValueError(f"got both --problem and --{given[0]}; expected one of them")
+        return load_problem(arguments.problem)
+    for name in ("map", "start", "goal"):
+        if getattr(arguments, name) is None:
+            raise ValueError(
+                f"--{name} is missing; expected --map, --start and --goal, or --problem with one "
+                f"of {', '.join(problem_names())}"
+            )
+    robot = load_robot(arguments.robot or "snake")
+    q_start, q_goal = (check_shape(robot, getattr(arguments, n), n) for n in ("start", "goal"))
+    if arguments.crop is not None and len(arguments.crop) != 4:
+        raise ValueError(f"--crop has {len(arguments.crop)} numbers; expected x0,y0,x1,y1")
+    return Problem(
+        name=Path(arguments.map).stem,
+        robot=robot,
+        grid=load_map(arguments.map, crop=arguments.crop),
+        map_file=Path(arguments.map),
+        q_start=q_start,
+        q_goal=q_goal,
+    )
+
+
+def _record(problem, method: str, seed: int, result) -> dict:
     """What ``path.json`` holds."""
     return {
-        "robot": robot,
-        "map": str(arguments.map),
-        "method": arguments.method,
-        "seed": arguments.seed,
+        "robot": problem.robot.name,
+        "map": str(problem.map_file),
+        "method": method,
+        "seed": seed,
         "status": result.status.name,
         "refused": result.refused,
         "verified": bool(result.verification and result.verification.ok),

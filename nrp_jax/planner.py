@@ -12,6 +12,13 @@ import numpy as np
 from nrp_jax.config import EDGE_STEPS, PlannerConfig
 from nrp_jax.homes.grid import Grid
 from nrp_jax.planners.nrp import NeuralRRT
+from nrp_jax.planners.nrp_connect import (
+    NRPConnect,
+    default_planner,
+    packaged_sampler,
+    search_connect,
+)
+from nrp_jax.planners.restarts import search_with_restarts
 from nrp_jax.samplers import check_fits, load_sampler
 from nrp_jax.scene.configurations import check_configuration
 from nrp_jax.scene.exact import ExactScene, verify
@@ -31,8 +38,10 @@ from vrrt_jax.core.search import SearchResult, make_termination, no_search, sear
 from vrrt_jax.core.settings import check_settings
 from vrrt_jax.core.types import ExpansionPolicy
 
-PLANNERS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g")
-KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae"}  # of the samplers that planners need
+CONNECT = ("nrp-connect", "nrp-star-connect")
+PLANNERS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g", *CONNECT)
+# Of the samplers that planners need.
+KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae", **dict.fromkeys(CONNECT, "cvae")}
 ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
 ADVICE = {
     Status.SOLVED: "",
@@ -54,7 +63,7 @@ def plan(
     q_goal: np.ndarray | ConfigurationGoal,
     *,
     key: jax.Array,
-    planner: str | ExpansionPolicy = "rrt-connect",
+    planner: str | ExpansionPolicy | None = None,
     method: str | None = None,
     sampler: Any = None,
     world: GridWorld | None = None,
@@ -75,10 +84,11 @@ def plan(
         q_goal: (D,) configuration, or a goal that holds one.
         key: random key; the same key gives the same plan on the same machine, unless time ends it.
         planner: one of :data:`PLANNERS`, or a policy of the kernel, see
-            :class:`~vrrt_jax.core.types.ExpansionPolicy`.
+            :class:`~vrrt_jax.core.types.ExpansionPolicy`. By default "nrp-connect" where the
+            packaged networks fit robot and map, otherwise "rrt-connect".
         method: another word for ``planner``.
-        sampler: what proposes waypoints to "nrp-d" and "nrp-g": a pytree with ``propose(world,
-            q_from, q_goal, key)``; the packaged weights by default.
+        sampler: what proposes waypoints to "nrp-d", "nrp-g" and "nrp-connect": a pytree with
+            ``propose(world, q_from, q_goal, key)``; the packaged weights by default.
         world: of this robot and grid, to save building it again; its ``is_free`` is obeyed.
         scene: the exact scene of this robot and grid, to save building it again.
         config: settings, the default ones if None.
@@ -92,6 +102,7 @@ def plan(
     config = _config(config, settings)
     planner = _planner(planner, method)
     world = build_world(robot, grid) if world is None else world
+    planner = default_planner(robot, world) if planner is None else planner
     q_start = check_configuration(robot, world, q_start, "start")
     goal = q_goal if isinstance(q_goal, ConfigurationGoal) else ConfigurationGoal(q=q_goal)
     q_goal = check_configuration(robot, world, goal.q, "goal")
@@ -120,7 +131,8 @@ def plan(
             if attempt and (config.max_expansions - tried < policy.lanes or left_s <= 0):
                 break
             iterations = max((config.max_expansions - tried) // policy.lanes, 1)
-            found = search(
+            found, path = _searched(
+                planner,
                 world,
                 goal,
                 policy,
@@ -131,7 +143,6 @@ def plan(
                 max_capacity=config.max_capacity,
                 on_progress=on_progress,
             )
-            path = policy.extract_path(found.tree)
             check_extracted_path(policy, path, np.asarray(start))
             raw = np.asarray(start)[None] if path is None else path
             results.append(_finish(scene, world, places, goal, raw, found, key))
@@ -151,6 +162,17 @@ def plan(
         rejected=dict(rejected),
     )
     return _moved(result, places)
+
+
+def _searched(
+    planner: str | ExpansionPolicy, world: GridWorld, goal: Any, policy: Any, tree: Any, **options
+) -> tuple[SearchResult, np.ndarray | None]:
+    """What a planner finds, and the path (P, D) if there is one."""
+    if planner == "nrp-star-connect":
+        return search_with_restarts(world, goal, policy, tree, **options)
+    grow = search_connect if isinstance(policy, NRPConnect) else search
+    found = grow(world, goal, policy, tree, **options)
+    return found, policy.extract_path(found.tree)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -179,19 +201,21 @@ def _moved(result: PlanResult, places: _Places) -> PlanResult:
     return dataclasses.replace(result, tree=tree, **paths, **ends)
 
 
-def _planner(planner: str | ExpansionPolicy, method: str | None) -> str | ExpansionPolicy:
-    """The planner that is asked for.
+def _planner(
+    planner: str | ExpansionPolicy | None, method: str | None
+) -> str | ExpansionPolicy | None:
+    """The planner that is asked for, None for the default.
 
     Raises:
         ValueError: two are, the name is unknown, or the object is no policy.
     """
     if method is not None:
-        if planner != "rrt-connect":
+        if planner is not None:
             raise ValueError("got both planner and method; expected one of them")
         planner = method
-    if not isinstance(planner, str):
+    if planner is not None and not isinstance(planner, str):
         check_policy(planner)
-    elif planner not in PLANNERS:
+    elif planner not in (None, *PLANNERS):
         raise ValueError(f"unknown planner '{planner}'; have: {', '.join(PLANNERS)}")
     return planner
 
@@ -227,8 +251,12 @@ def _policy(
     shape = {"keep_partial": True, "lanes": config.lanes, "edge_steps": EDGE_STEPS}
     if planner in ("rrt", "rrt-is"):
         return RRT(goal_bias=bias, intermediate=planner == "rrt-is", **shape)
+    if sampler is None and planner in CONNECT:
+        sampler = packaged_sampler(robot.name)
     sampler = load_sampler(robot.name, KINDS[planner]) if sampler is None else sampler
     check_fits(sampler, robot, world, KINDS[planner])
+    if planner in CONNECT:
+        return NRPConnect(sampler=sampler, lanes=max(config.lanes, 2))
     rate = jnp.float32(config.straight_rate)
     return NeuralRRT(goal_bias=bias, sampler=sampler, straight_rate=rate, **shape)
 

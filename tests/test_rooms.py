@@ -28,7 +28,7 @@ NRP_ROOMS = (
     ("learning",),
     ("samplers",),
     ("planners",),
-    ("planner",),
+    ("planner", "problems"),
     ("viz",),
     ("bench",),
     ("cli",),

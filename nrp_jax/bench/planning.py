@@ -13,7 +13,8 @@ import numpy as np
 from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning.difficulty import EXPANSIONS, MIN_GEODESIC, fair_house, long_queries
 from nrp_jax.learning.shards import DatasetSettings, home_seed
-from nrp_jax.planner import KINDS, PLANNERS, PlanResult, Status, plan
+from nrp_jax.planner import CONNECT, KINDS, PLANNERS, PlanResult, Status, plan
+from nrp_jax.planners.nrp_connect import UNCHECKED
 from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.robots import MobileRobot, load_robot
 from nrp_jax.scene.world import GridWorld, build_world
@@ -157,7 +158,12 @@ def _run_command(arguments: argparse.Namespace) -> int:
             raise ValueError(f"{name} is {getattr(arguments, name)}; expected at least 1")
     robot = load_robot(arguments.task)
     samplers = {
-        method: load_sampler(robot.name, KINDS[method], getattr(arguments, KINDS[method]))
+        method: load_sampler(
+            robot.name,
+            KINDS[method],
+            getattr(arguments, KINDS[method]),
+            **(UNCHECKED if method in CONNECT else {}),
+        )
         for method in methods
         if method in KINDS
     }

@@ -1,0 +1,90 @@
+"""Restarts: after a first path, search anew and keep the shortest path until the budget ends."""
+
+import dataclasses
+import itertools
+import time
+from typing import Any
+
+import jax
+import numpy as np
+
+from nrp_jax.planners.nrp_connect import NRPConnect, search_connect
+from nrp_jax.scene.world import GridWorld
+from vrrt_jax.core.goal import ConfigurationGoal
+from vrrt_jax.core.search import SearchResult, StopReason, Termination
+from vrrt_jax.core.shortcut import path_length, shortcut
+from vrrt_jax.core.types import Tree
+
+COST = 4  # column of a history: length of the best path
+
+
+def search_with_restarts(
+    world: GridWorld,
+    goal: ConfigurationGoal,
+    policy: NRPConnect,
+    tree: Tree,
+    *,
+    key: jax.Array,
+    termination: Termination,
+    time_limit_s: float,
+    **options: Any,
+) -> tuple[SearchResult, np.ndarray | None]:
+    """Search again and again with new trees, shorten every path, and keep the shortest.
+
+    Args:
+        world: the robot in a home.
+        goal: where to.
+        policy: the planner.
+        tree: from ``policy.init``; every search begins with it.
+        key: random key.
+        termination: of all searches together; they go on after the goal is reached.
+        time_limit_s: wall time of searches and shortcuts without compilation [s].
+        options: of :func:`vrrt_jax.core.search.search`.
+
+    Returns:
+        What was found, with the tree of the shortest path, and that path (P, D); None if no search
+        found one. The history has the length of the shortest path so far, with its shortcuts.
+    """
+    finer = dataclasses.replace(world, resolution=world.resolution / 2)
+    best, path, cost = None, None, np.inf
+    iterations, nodes, seconds, compile_s = 0, 0, 0.0, 0.0
+    history = np.zeros((0, 6))
+    for attempt in itertools.count():
+        left = np.int32(int(termination.max_iterations) - iterations)
+        found = search_connect(
+            world,
+            goal,
+            policy,
+            tree,
+            key=jax.random.fold_in(key, attempt),
+            termination=dataclasses.replace(termination, max_iterations=left),
+            time_limit_s=time_limit_s - seconds,
+            **options,
+        )
+        # The rows of this search, after those before; they tell of paths before their shortcuts.
+        rows = np.array(found.history)
+        rows[:, [0, 1, 3]] += [iterations, seconds, nodes]
+        rows[:, 5] += history[-1, 5] if len(history) else 0.0
+        rows[:, COST] = np.minimum(rows[:, COST], cost)
+        iterations, seconds = iterations + int(found.tree.iteration), seconds + found.search_s
+        nodes, compile_s = nodes + int(found.tree.size), compile_s + found.compile_s
+        raw = policy.extract_path(found.tree)
+        if raw is not None:
+            started = time.perf_counter()
+            short = shortcut(finer, raw, key=jax.random.fold_in(key, attempt))
+            seconds += time.perf_counter() - started
+            if (length := path_length(finer, short)) < cost:
+                best, path, cost = found, short, length
+            rows = np.vstack([rows, [iterations, seconds, *rows[-1, 2:4], cost, rows[-1, 5]]])
+        history = np.vstack([history, rows])
+        over = seconds >= time_limit_s or iterations >= int(termination.max_iterations)
+        if found.stopped is not StopReason.REACHED or over:
+            break
+    kept = found if best is None else best
+    return dataclasses.replace(
+        kept,
+        tree=dataclasses.replace(kept.tree, iteration=np.int32(iterations)),
+        history=history,
+        search_s=seconds,
+        compile_s=compile_s,
+    ), path
