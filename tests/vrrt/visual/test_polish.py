@@ -84,6 +84,6 @@ def test_outer_joints_are_drawn_anew(panda, open_world, rng):
     q = np.stack([panda.home, panda.home + 0.1]).astype(np.float32)
     samples = redraw_outer(open_world, q, 400, rng)
     near = np.abs(samples - np.resize(q, samples.shape)) < 0.3
-    # The first joint always stays, the last never, and those in between more rarely the farther out.
+    # The first joint always stays, the last never, the others the more rarely the farther out.
     share = near.mean(axis=0)
     assert share[0] == 1.0 and np.all(np.diff(share) < 0.05) and share[-1] < 0.3
