@@ -50,9 +50,7 @@ class Scenery:
     def photograph(self) -> Photograph:
         """How the goal images are taken."""
         brightness = 1.0 if isinstance(self.light, str) else self.light
-        return Photograph(
-            brightness=brightness, noise=self.noise, jpeg=self.jpeg, mask=self.mask
-        )
+        return Photograph(brightness=brightness, noise=self.noise, jpeg=self.jpeg, mask=self.mask)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -186,9 +184,7 @@ def goal_images(
 
 
 @functools.lru_cache(maxsize=2)
-def _renderer(
-    robot_name: str, hiding: tuple[Obstacle, ...], from_side: bool
-) -> MeshRenderer:
+def _renderer(robot_name: str, hiding: tuple[Obstacle, ...], from_side: bool) -> MeshRenderer:
     robot = bench_robot(robot_name)
     spec = mesh_spec(robot)
     if spec is None:

@@ -5,6 +5,7 @@ under lamps from anywhere, and photographed in several ways. A threshold is met 
 poses in the hardest of these conditions.
 """
 
+import contextlib
 import dataclasses
 
 import jax
@@ -24,12 +25,11 @@ from vrrt_jax.splat.types import Camera
 
 PHOTOGRAPHS = {
     "as trained": Photograph(),
-    "half as bright": Photograph(brightness=0.5),
     "twice as bright": Photograph(brightness=2.0),
-    "noise": Photograph(noise=0.05),
-    "JPEG 60": Photograph(jpeg=60),
-    "estimated mask": Photograph(mask="estimated"),
+    "half as bright, noise, JPEG": Photograph(brightness=0.5, noise=0.05, jpeg=60),
+    "estimated mask, JPEG": Photograph(jpeg=60, mask="estimated"),
 }
+BACKGROUNDS = ((0.1, 0.5, 0.2), (0.1, 0.2, 0.7), (0.8, 0.2, 0.6))  # of estimated masks, in turns
 OTHER_LAMP = "another lamp"
 LAMPS = 6  # that shine from far away, in turns
 MATCHED = 0.95  # share of correct poses that match, in each condition
@@ -93,9 +93,12 @@ def losses(robot, spec, levels, tip, *, seed: int, config: FitConfig) -> list[di
     for i, camera in enumerate(tqdm(cameras, desc="calibrating", unit="pose", leave=False)):
         picture = trained.picture(q[i], camera)
         for name, how in PHOTOGRAPHS.items():
-            # The border of a close-up does not show the background.
-            if tip is None or how.mask == "true":
-                add(name, _view(*photograph(picture, how, rng), camera), q[i])
+            how = dataclasses.replace(how, background=BACKGROUNDS[i % len(BACKGROUNDS)])
+            # The border of a close-up does not show the background. And a robot in its color is
+            # nobody's goal image.
+            with contextlib.suppress(ValueError):
+                if tip is None or how.mask == "true":
+                    add(name, _view(*photograph(picture, how, rng), camera), q[i])
         other = others[i % LAMPS].picture(q[i], camera)
         add(OTHER_LAMP, _view(other.rgb, other.alpha, camera), q[i])
     return found

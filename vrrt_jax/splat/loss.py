@@ -14,9 +14,9 @@ from vrrt_jax.splat.raster import render
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
 from vrrt_jax.splat.windows import Windows
 
-COLOR_WEIGHT = 0.1  # of a squared color error, relative to the goal's brightness, beside coverage
+COLOR_WEIGHT = 0.01  # of a squared color error, relative to the goal's brightness, beside coverage
 OVEREXPOSED = 0.97  # from which on a pixel may have been brighter than the image can say
-FEW_PIXELS = 1e-3  # share of an image that tells no gain; without more, the gain is near 1
+FEW_PIXELS = 1e-4  # share of an image that tells no gain; without more, the gain is near 1
 DARKEST = 0.02  # mean brightness of a robot, below which its noise is not scaled up any more
 
 
