@@ -7,27 +7,31 @@ poses in the hardest of these conditions.
 
 import contextlib
 import dataclasses
+from collections.abc import Iterable
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from tqdm import tqdm
 
 from vrrt_jax.core.precision import single_precision
+from vrrt_jax.robots.kinematics import Chain, link_poses
 from vrrt_jax.splat.fit_config import FitConfig
 from vrrt_jax.splat.images import View, shrink_views
-from vrrt_jax.splat.loss import goal_loss
+from vrrt_jax.splat.loss import weighted, weighted_goal
 from vrrt_jax.splat.model import Level, SelfModel
 from vrrt_jax.splat.mujoco_images import MeshRenderer
 from vrrt_jax.splat.photographs import Photograph, photograph
+from vrrt_jax.splat.raster import render
 from vrrt_jax.splat.training_images import random_cameras, random_configurations
-from vrrt_jax.splat.types import Camera
+from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
 
 PHOTOGRAPHS = {
     "as trained": Photograph(),
     "twice as bright": Photograph(brightness=2.0),
     "half as bright, noise, JPEG": Photograph(brightness=0.5, noise=0.05, jpeg=60),
-    "estimated mask, JPEG": Photograph(jpeg=60, mask="estimated"),
+    "estimated mask": Photograph(mask="estimated"),
 }
 BACKGROUNDS = ((0.1, 0.5, 0.2), (0.1, 0.2, 0.7), (0.8, 0.2, 0.6))  # of estimated masks, in turns
 OTHER_LAMP = "another lamp"
@@ -86,11 +90,8 @@ def losses(robot, spec, levels, tip, *, seed: int, config: FitConfig) -> list[di
     others = [MeshRenderer(spec, shines=_downwards(rng)) for _ in range(LAMPS)]
     found: list[dict[str, list]] = [{} for _ in levels]
 
-    def add(condition: str, view: View, q: np.ndarray) -> None:
-        for level, of_level in zip(levels, found, strict=True):
-            of_level.setdefault(condition, []).append(_loss(robot, level, view, q))
-
     for i, camera in enumerate(tqdm(cameras, desc="calibrating", unit="pose", leave=False)):
+        views = {}
         picture = trained.picture(q[i], camera)
         for name, how in PHOTOGRAPHS.items():
             how = dataclasses.replace(how, background=BACKGROUNDS[i % len(BACKGROUNDS)])
@@ -98,9 +99,12 @@ def losses(robot, spec, levels, tip, *, seed: int, config: FitConfig) -> list[di
             # nobody's goal image.
             with contextlib.suppress(ValueError):
                 if tip is None or how.mask == "true":
-                    add(name, _view(*photograph(picture, how, rng), camera), q[i])
+                    views[name] = _view(*photograph(picture, how, rng), camera)
         other = others[i % LAMPS].picture(q[i], camera)
-        add(OTHER_LAMP, _view(other.rgb, other.alpha, camera), q[i])
+        views[OTHER_LAMP] = _view(other.rgb, other.alpha, camera)
+        for level, of_level in zip(levels, found, strict=True):
+            for name, loss in zip(views, _losses(robot, level, views.values(), q[i]), strict=True):
+                of_level.setdefault(name, []).append(loss)
     return found
 
 
@@ -115,13 +119,23 @@ def _view(rgb: np.ndarray, alpha: np.ndarray, camera: Camera) -> View:
     return View(rgb=rgb, alpha=alpha, valid=np.ones_like(alpha), camera=camera)
 
 
-def _loss(robot, level: Level, view: View, q: np.ndarray) -> float:
-    goal, camera = shrink_views([view], level.size_px)
-    loss = _goal_loss(robot.chain, level.splats, camera, goal, q.astype(np.float32))
-    return float(loss) / max(float(goal.alpha.mean()), LEAST_COVERED)
+def _losses(robot, level: Level, views: Iterable[View], q: np.ndarray) -> list[float]:
+    """Losses of views of one camera at their configuration (D,), which is drawn once."""
+    goals, cameras = zip(*(shrink_views([view], level.size_px) for view in views), strict=True)
+    image = _draw(robot.chain, level.splats, cameras[0], jnp.asarray(q, jnp.float32))
+    covered = (max(float(goal.alpha.mean()), LEAST_COVERED) for goal in goals)
+    return [float(_loss(image, goal)) / share for goal, share in zip(goals, covered, strict=True)]
 
 
-_goal_loss = jax.jit(goal_loss)
+@jax.jit
+def _draw(chain: Chain, splats: SplatModel, cameras: Camera, q: jax.Array):
+    camera = jax.tree.map(lambda leaf: leaf[0], cameras)
+    return jax.tree.map(lambda a: a[None], render(splats, link_poses(chain, q), camera))
+
+
+@jax.jit
+def _loss(image: tuple[jax.Array, jax.Array], goal: GoalImage) -> jax.Array:
+    return jnp.sum((weighted(*image, goal) - weighted_goal(goal)) ** 2)
 
 
 def _threshold(of_level: dict[str, list]) -> float:
