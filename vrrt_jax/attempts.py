@@ -97,6 +97,7 @@ def attempt(
         termination=termination_of(config, policy, problem.goal),
         time_limit_s=config.budget.time_limit_s,
         max_capacity=config.tree.max_capacity,
+        copies=config.lineages.trees if isinstance(policy, LineageRRT) else 1,
         on_progress=on_progress,
     )
     found = dataclasses.replace(found, compile_s=found.compile_s + compile_s)

@@ -25,6 +25,7 @@ class LineageConfig:
     """How the tree grows: scattered edges, lineages that jump, lineages that descend."""
 
     num: int = setting(64, 0, 1024)  # lineages; 0 = the published planner instead (re-compiles)
+    trees: int = setting(2, 1, 64)  # such trees grow at once, one a core, and become one tree
     radius: float = setting(2.8, 0.0)  # how far edges scatter from the start [rad]
     samples: int = setting(1024, 1, 1 << 20)  # such edges
     jumps: int = setting(64, 0, 1 << 20)  # random changes of each lineage's best node

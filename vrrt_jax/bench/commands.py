@@ -54,7 +54,9 @@ def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
     parser.set_defaults(run=_protocol)
     parser.add_argument("--robot", required=True, help="panda, ur5e or fetch")
     levels = "0.5,1.0,1.5,2.0,2.5"
-    parser.add_argument("--levels", type=command.numbers, default=levels, help="distances [rad]")
+    parser.add_argument(
+        "--levels", type=_levels, default=levels, help="distances [rad], or random: any pairs"
+    )
     parser.add_argument(
         "--tasks-per-level",
         type=command.whole(1, 100_000),
@@ -70,6 +72,13 @@ def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
             "--method", default="vrrt", help="vrrt, dr-robot, dr-robot-rrt-star or prof-robot"
         )
         parser.add_argument("--config", default="default", help="default or paper")
+    if what != "pose":
+        parser.add_argument(
+            "--worlds", default="standard", help="standard, or hard: all straight lines are blocked"
+        )
+        parser.add_argument(
+            "--problems", help="a folder of joint-goal problems: their scenes and goals instead"
+        )
     parser.add_argument(
         "--views", type=command.whole(1, 2), default=1, choices=(1, 2), help="cameras"
     )
@@ -165,12 +174,12 @@ def _protocol(arguments: argparse.Namespace) -> int:
     from vrrt_jax.bench import protocol, runner, tables
     from vrrt_jax.bench.tasks import Scenery
 
-    choices = ("method", "config", "only", "engine")
+    choices = ("method", "config", "only", "engine", "worlds", "problems")
     chosen = {name: getattr(arguments, name) for name in choices if hasattr(arguments, name)}
     benchmark = protocol.benchmark(
         arguments.what,
         arguments.robot,
-        levels=arguments.levels.tolist(),
+        levels=arguments.levels,
         tasks_per_level=arguments.tasks_per_level,
         seed=arguments.seed,
         time_limit_s=arguments.time_limit,
@@ -203,6 +212,14 @@ def _arm(arguments: argparse.Namespace) -> int:
     )
     print(arm_table.to_text(arm.run(benchmark, files, arguments.json)))
     return EXIT_SOLVED
+
+
+def _levels(text: str) -> list[float | str]:
+    """Distances, and the word random for any pairs."""
+    words = [word.strip() for word in text.split(",")]
+    numbers = ",".join(word for word in words if word != "random")
+    distances = command.numbers(numbers).tolist() if numbers else []
+    return [*distances, *["random"] * ("random" in words)]
 
 
 def _joint_values(text: str) -> dict[str, float]:

@@ -20,6 +20,7 @@ from vrrt_jax.bench.tasks import (
     cameras,
     goal_images,
     image_psnr,
+    level_name,
 )
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.edges import joint_error
@@ -28,7 +29,7 @@ from vrrt_jax.core.shortcut import path_length
 from vrrt_jax.problems import self_model_path
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.verify import verify_path
-from vrrt_jax.scene.world import World, obstacle_list
+from vrrt_jax.scene.world import World
 from vrrt_jax.splat.model import SelfModel, load_self_model
 
 METHODS = ("vrrt", "dr-robot", "prof-robot", "dr-robot-rrt-star")
@@ -102,7 +103,7 @@ def solve(
     """
     robot, world = bench_robot(robot_name), bench_world(robot_name, task.world, engine)
     images, masks = goal_images(robot_name, task, scenery)
-    task_seed = zlib.crc32(f"{seed} {task.level:.3f} {task.index}".encode())
+    task_seed = zlib.crc32(f"{seed} {level_name(task.level)} {task.index}".encode())
     key = jax.random.key(task_seed)
     self_model = _self_model(robot_name)
     inputs = (robot, world, self_model, cameras(robot_name, scenery), images, task.q_start)
@@ -118,7 +119,7 @@ def solve(
 
     error = joint_error(world, attempt.path[-1], task.q_goal)
     right = bool(error.mean() < SUCCESS_RAD)
-    valid = not collisions or verify_path(robot, obstacle_list(world), attempt.path).ok
+    valid = not collisions or verify_path(robot, world, attempt.path).ok
     success = right and valid and (attempt.has_path or not collisions)
     psnr_db = image_psnr(robot_name, attempt.path[-1], images, scenery, masks)
     length = path_length(world, attempt.path)
@@ -135,6 +136,7 @@ def solve(
         "level": task.level,
         "index": task.index,
         "world": task.world,
+        "distance_rad": round(path_length(world, np.stack([task.q_start, task.q_goal])), 3),
         "straight_is_blocked": task.straight_is_blocked,
         "success": success,
         "cause": cause,

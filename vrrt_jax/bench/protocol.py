@@ -4,8 +4,9 @@ import math
 from collections.abc import Sequence
 
 from vrrt_jax.bench.methods import CONFIGS, METHODS
+from vrrt_jax.bench.problem_tasks import files_of, usable_problems
 from vrrt_jax.bench.runner import Benchmark, Variant
-from vrrt_jax.bench.tasks import ROBOTS, Scenery
+from vrrt_jax.bench.tasks import RANDOM, ROBOTS, Scenery
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.scene.world import ENGINES
 
@@ -37,6 +38,7 @@ ABLATIONS = {
         "budget.settle_iterations": (0,),
     },
 }
+WORLDS = ("standard", "hard")
 GUESS_SIGMAS = (0.05, 0.10, 0.15, 0.20)  # [rad]
 
 
@@ -44,7 +46,7 @@ def benchmark(
     what: str,
     robot: str,
     *,
-    levels: Sequence[float],
+    levels: Sequence[float | str],
     tasks_per_level: int,
     seed: int,
     method: str = "vrrt",
@@ -53,13 +55,15 @@ def benchmark(
     engine: str = "mjx",
     scenery: Scenery | None = None,
     time_limit_s: float = 60.0,
+    worlds: str = "standard",
+    problems: str | None = None,
 ) -> Benchmark:
     """Put a benchmark together.
 
     Args:
         what: "visual" (the paper's tasks), "pose" (no obstacles) or "ablation".
         robot: one of :data:`~vrrt_jax.bench.tasks.ROBOTS`.
-        levels: distances from start to goal [rad].
+        levels: distances from start to goal [rad], or "random" for any pairs.
         tasks_per_level: number of tasks at each.
         seed: of tasks and method.
         method: one of :data:`~vrrt_jax.bench.methods.METHODS`.
@@ -68,8 +72,12 @@ def benchmark(
         engine: of the world that is planned in.
         scenery: what goal images look like.
         time_limit_s: of one search [s].
+        worlds: "standard", or "hard" for tasks whose straight line is blocked.
+        problems: a folder of joint-goal problems, whose scenes, starts and goals are the tasks; the
+            levels are then its files.
 
     Raises:
+        FileNotFoundError: there are no problems in the folder.
         ValueError: a name is unknown, or a number makes no sense.
     """
     for name, value, known in (
@@ -77,15 +85,20 @@ def benchmark(
         ("method", method, METHODS),
         ("config", config, CONFIGS),
         ("engine", engine, ENGINES),
+        ("worlds", worlds, WORLDS),
         ("ablation", only, (None, *map(_short, ABLATIONS.get(config, ())), "guess")),
     ):
         if value not in known:
             names = ", ".join(str(n) for n in known if n is not None)
             raise ValueError(f"unknown {name} '{value}'; have: {names}")
-    if tasks_per_level < 1 or not levels or not all(0 < level < math.inf for level in levels):
+    if problems is not None:
+        if what == "pose" or worlds == "hard":
+            raise ValueError("problems come with their own worlds; drop 'pose', or 'hard'")
+        levels = _levels_of(problems, robot, tasks_per_level)
+    if tasks_per_level < 1 or not levels or not all(map(_is_level, levels)):
         raise ValueError(
             f"got levels {list(levels)} and {tasks_per_level} tasks a level; expected distances "
-            "above 0 and at least one task"
+            f"above 0 or '{RANDOM}', and at least one task"
         )
     settings = PlannerConfig.paper() if config == "paper" else PlannerConfig()
     settings = settings.changed({"budget.time_limit_s": time_limit_s})
@@ -99,7 +112,24 @@ def benchmark(
         engine=engine,
         variants=_ablations(config, only, base.config) if what == "ablation" else (base,),
         scenery=scenery or Scenery(),
+        hard=worlds == "hard",
+        problems=problems or "",
     )
+
+
+def _is_level(level: float | str) -> bool:
+    return isinstance(level, str) or 0 < level < math.inf
+
+
+def _levels_of(folder: str, robot: str, tasks: int) -> tuple[str, ...]:
+    """The files of a folder of problems, each of which has enough of them."""
+    for file in files_of(folder, robot).values():
+        if tasks > (num := len(usable_problems(file, robot))):
+            raise ValueError(
+                f"'{file}' has {num} problems whose ends are free; expected {tasks}: lower "
+                "tasks_per_level"
+            )
+    return tuple(files_of(folder, robot))
 
 
 def _ablations(config: str, only: str | None, base: PlannerConfig) -> tuple[Variant, ...]:

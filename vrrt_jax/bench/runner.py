@@ -12,8 +12,9 @@ import numpy as np
 from tqdm import tqdm
 
 from vrrt_jax.bench.methods import CAUSES, solve
+from vrrt_jax.bench.problem_tasks import files_of, problem_task
 from vrrt_jax.bench.results_file import fingerprint, plain, resume, write
-from vrrt_jax.bench.tasks import Scenery, bench_robot, make_task
+from vrrt_jax.bench.tasks import Scenery, Task, bench_robot, make_task
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.command import end_with_parent
 from vrrt_jax.core.interrupt import uninterrupted
@@ -21,7 +22,7 @@ from vrrt_jax.core.timing import machine
 from vrrt_jax.problems import self_model_path
 from vrrt_jax.report import versions
 
-FORMAT = 3
+FORMAT = 4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,23 +41,34 @@ class Benchmark:
 
     what: str  # visual, pose or ablation
     robot: str
-    levels: tuple[float, ...]
+    levels: tuple[float | str, ...]  # the string "random", or names of problem files
     tasks_per_level: int
     seed: int
     variants: tuple[Variant, ...]
     scenery: Scenery
     engine: str  # of the world that is planned in
+    hard: bool = False  # only tasks whose straight line is blocked
+    problems: str = ""  # a folder of joint-goal problems, whose goals are shown as images
 
     @property
     def collisions(self) -> bool:
         """Whether there are obstacles, and paths are judged."""
         return self.what != "pose"
 
+    def task(self, level: float | str, index: int) -> Task:
+        """The task of a level with a number, drawn again from the seed."""
+        if self.problems:
+            return problem_task(self.problems, self.robot, str(level), index)
+        return make_task(
+            self.robot, level, index, self.seed, obstacles=self.collisions, hard=self.hard
+        )
+
     def header(self) -> dict[str, Any]:
         """What a results file must agree on, to be gone on with."""
         return {
             "format": FORMAT,
-            **{name: getattr(self, name) for name in ("what", "robot", "seed", "engine")},
+            **{name: getattr(self, name) for name in ("what", "robot", "seed", "engine", "hard")},
+            "problems": _fingerprints(self.problems, self.robot),
             "scenery": dataclasses.asdict(self.scenery),
             "variants": [plain(dataclasses.asdict(variant)) for variant in self.variants],
             "versions": versions(),
@@ -129,10 +141,10 @@ def _pin(cores: Any) -> None:
     os.sched_setaffinity(0, cores.get())
 
 
-def _run_task(benchmark: Benchmark, item: tuple[str, float, int]) -> dict[str, Any]:
+def _run_task(benchmark: Benchmark, item: tuple[str, float | str, int]) -> dict[str, Any]:
     name, level, index = item
     variant = next(v for v in benchmark.variants if v.name == name)
-    task = make_task(benchmark.robot, level, index, benchmark.seed, obstacles=benchmark.collisions)
+    task = benchmark.task(level, index)
     with uninterrupted():
         row = solve(
             benchmark.robot,
@@ -148,8 +160,17 @@ def _run_task(benchmark: Benchmark, item: tuple[str, float, int]) -> dict[str, A
     return {"variant": name, **row}
 
 
-def _key(row: dict[str, Any]) -> tuple[str, float, int]:
+def _key(row: dict[str, Any]) -> tuple[str, float | str, int]:
     return row["variant"], row["level"], row["index"]
+
+
+def _fingerprints(folder: str, robot: str) -> dict[str, str]:
+    """Of the files of problems, by name; {} without a folder."""
+    return (
+        {name: fingerprint(file) for name, file in files_of(folder, robot).items()}
+        if folder
+        else {}
+    )
 
 
 def _fresh(benchmark: Benchmark, jobs: int) -> dict[str, Any]:
@@ -172,12 +193,14 @@ def _summary(benchmark: Benchmark, rows: Sequence[dict[str, Any]]) -> dict[str, 
 def summarize(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """``average_success``, the mean of the levels', and ``levels``."""
     levels = []
-    for level in sorted({row["level"] for row in rows}):
+    # Distances in order, then the levels that have names.
+    for level in sorted({row["level"] for row in rows}, key=lambda x: (isinstance(x, str), x)):
         own = [row for row in rows if row["level"] == level]
         won = [row for row in own if row["success"]]
         levels.append(
             {
-                "distance_rad": level,
+                "level": level,
+                "distance_rad": _median(row.get("distance_rad", level) for row in own),
                 "n": len(own),
                 "success": _mean(row["success"] for row in own),
                 "false_solved": _mean(row["false_solved"] for row in own if "false_solved" in row),

@@ -33,7 +33,7 @@ def to_text(results: dict[str, Any]) -> str:
             rows.append(
                 [
                     name,
-                    f"{level['distance_rad']:g}",
+                    _level(level),
                     str(level["n"]),
                     _percent(level["success"]),
                     _percent(level.get("false_solved")),
@@ -168,8 +168,14 @@ def _command(results: dict[str, Any]) -> str:
     words += [f"--jpeg {scenery['jpeg']}"] if scenery.get("jpeg") is not None else []
     words += ["--mask estimated"] if scenery.get("mask") == "estimated" else []
     words += [f"--azimuth {scenery['azimuth_deg']:g}"] if scenery["azimuth_deg"] else []
-    levels = sorted({row["level"] for row in results["tasks"]})
-    words += ["--levels", ",".join(f"{level:g}" for level in levels)]
+    if results.get("problems"):
+        words += ["--problems DIR"]
+    else:
+        words += [
+            "--levels",
+            ",".join(map(_level, next(iter(_variants(results).values()))["levels"])),
+        ]
+    words += ["--worlds hard"] if results.get("hard") else []
     most = 1 + max((row["index"] for row in results["tasks"]), default=0)
     words += ["--tasks-per-level", str(most), "--seed", str(results["seed"])]
     return " ".join(words)
@@ -287,6 +293,12 @@ def _stack_bars(axis, labels: Sequence[str], stacks: Sequence[Sequence[float]], 
         axis.barh(labels, width, left=left, color=color, label=name)
         left += width
     axis.invert_yaxis()
+
+
+def _level(level: dict[str, Any]) -> str:
+    """A level's distance or name; older files have distances only."""
+    name = level.get("level", level["distance_rad"])
+    return name if isinstance(name, str) else f"{name:g}"
 
 
 def _percent(share: float | None) -> str:

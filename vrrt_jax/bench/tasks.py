@@ -8,6 +8,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.bench.arm_problems import ArmProblems, read_problems
+from vrrt_jax.bench.arm_trials import Refusal, pose_problem
 from vrrt_jax.core.edges import enforce_bounds
 from vrrt_jax.problems import load_world
 from vrrt_jax.robots import Robot, load_robot
@@ -15,7 +17,12 @@ from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 from vrrt_jax.robots.robot import workspace
 from vrrt_jax.scene.obstacles import Obstacle
 from vrrt_jax.scene.verify import contacts, verify_path
-from vrrt_jax.scene.world import World, batch_is_free, build_world, obstacle_list
+from vrrt_jax.scene.world import (
+    World,
+    batch_is_free,
+    build_world,
+    obstacle_list,
+)
 from vrrt_jax.splat.camera import orbit
 from vrrt_jax.splat.images import View
 from vrrt_jax.splat.mujoco_images import MeshRenderer, Picture
@@ -32,6 +39,7 @@ ELEVATION_DEG = -30.0
 DISTANCE = 2.1  # of the camera, in radii of the workspace
 SIDE = "side"  # the light of a lamp far away, to the left of the robot
 SHINES = (0.0, -0.87, -0.5)  # where that lamp shines
+RANDOM = "random"  # the level of pairs drawn anywhere inside the limits
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -57,9 +65,9 @@ class Scenery:
 class Task:
     """Where from and where to; ``q_goal`` is for rendering and scoring alone."""
 
-    level: float  # distance from start to goal [rad]
+    level: float | str  # distance from start to goal [rad], RANDOM, or the name of a problems file
     index: int
-    world: str  # its packaged name; "" for none
+    world: str  # its packaged name, "" for none, or FILE#INDEX of a problem in a file
     q_start: np.ndarray  # (D,)
     q_goal: np.ndarray  # (D,)
     straight_is_blocked: bool
@@ -84,22 +92,38 @@ def bench_world(robot: str, name: str, engine: str = "closed_form") -> World:
     Tasks are drawn in the world of the fast engine, so that they are the same for all engines.
     """
     settings: dict[str, Any] = {"engine": engine, "num_slots": NUM_SLOTS}
+    file, of_file, index = name.partition("#")
+    if of_file:
+        empty = build_world(bench_robot(robot), [], **settings)
+        trial = pose_problem(bench_robot(robot), empty, problems_of(file, robot), int(index))
+        if isinstance(trial, Refusal):
+            raise ValueError(f"problem {index} of '{file}': {trial.reason}; take another")
+        return trial.world
     if not name:
         return build_world(bench_robot(robot), [], **settings)
     return load_world(name, bench_robot(robot), **settings)
 
 
-def make_task(robot_name: str, level: float, index: int, seed: int, *, obstacles: bool) -> Task:
+def make_task(
+    robot_name: str,
+    level: float | str,
+    index: int,
+    seed: int,
+    *,
+    obstacles: bool,
+    hard: bool = False,
+) -> Task:
     """Draw a task: free ends inside the limits, a set distance apart.
 
     Tasks take turns among the robot's worlds. The same arguments always give the same task.
 
     Args:
         robot_name: one of :data:`ROBOTS`.
-        level: distance from start to goal [rad].
+        level: distance from start to goal [rad]; :data:`RANDOM` draws both ends alike.
         index: of the task at this level.
         seed: of the benchmark.
         obstacles: whether there are any.
+        hard: whether only tasks count whose straight line from start to goal is blocked.
 
     Raises:
         ValueError: there seems to be no such task.
@@ -108,12 +132,15 @@ def make_task(robot_name: str, level: float, index: int, seed: int, *, obstacles
     name = f"{robot_name}_{1 + index % WORLDS_PER_ROBOT}" if obstacles else ""
     world = bench_world(robot_name, name)
     listed = obstacle_list(world)
-    key = f"{robot_name} {level:.3f} {index} {obstacles}"
+    key = f"{robot_name} {level_name(level)} {index} {obstacles}"
     rng = np.random.default_rng([seed, zlib.crc32(key.encode())])
     for _ in range(MOST_DRAWS):
         q_start = rng.uniform(robot.lower, robot.upper, (256, robot.num_joints))
-        step = rng.normal(size=q_start.shape)
-        q_goal = q_start + level * step / np.linalg.norm(step, axis=1, keepdims=True)
+        if isinstance(level, str):
+            q_goal = rng.uniform(robot.lower, robot.upper, q_start.shape)
+        else:
+            step = rng.normal(size=q_start.shape)
+            q_goal = q_start + level * step / np.linalg.norm(step, axis=1, keepdims=True)
         inside = robot.is_continuous | ((q_goal > robot.lower) & (q_goal < robot.upper))
         q_goal = np.asarray(enforce_bounds(world, jnp.asarray(q_goal, jnp.float32)))
         free = [
@@ -123,19 +150,39 @@ def make_task(robot_name: str, level: float, index: int, seed: int, *, obstacles
             ends = q_start[i].astype(np.float32), q_goal[i]
             if any(contacts(robot, listed, q) for q in ends):
                 continue
-            straight = verify_path(robot, listed, np.stack(ends), step=0.02)
+            is_blocked = straight_is_blocked(robot, world, *ends)
+            if hard and not is_blocked:
+                continue
             return Task(
                 level=level,
                 index=index,
                 world=name,
                 q_start=ends[0],
                 q_goal=ends[1],
-                straight_is_blocked=not straight.ok,
+                straight_is_blocked=is_blocked,
             )
     raise ValueError(
-        f"found no free start and goal of '{robot_name}' {level:g} rad apart; expected levels such "
-        "as the paper's, 0.5 to 2.5 rad"
+        f"found no free start and goal of '{robot_name}' for the level {level_name(level)}; "
+        "expected levels such as the paper's, 0.5 to 2.5 rad"
     )
+
+
+def level_name(level: float | str) -> str:
+    """A level in the keys of random numbers."""
+    return level if isinstance(level, str) else f"{level:.3f}"
+
+
+def straight_is_blocked(
+    robot: Robot, world: World, q_start: np.ndarray, q_goal: np.ndarray
+) -> bool:
+    """Whether C MuJoCo finds the straight line between two configurations (D,) blocked."""
+    return not verify_path(robot, world, np.stack([q_start, q_goal]), step=0.02).ok
+
+
+@functools.lru_cache(maxsize=8)
+def problems_of(file: str, robot_name: str) -> ArmProblems:
+    """The problems of a file, read once."""
+    return read_problems(file, bench_robot(robot_name))
 
 
 @functools.cache

@@ -3,7 +3,8 @@
 import dataclasses
 import enum
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -15,7 +16,7 @@ from vrrt_jax.core.edges import Space
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.precision import single_precision
-from vrrt_jax.core.tree import with_capacity
+from vrrt_jax.core.tree import joined, path_cost, with_capacity
 from vrrt_jax.core.types import ExpansionPolicy, Tree, pytree
 
 MAX_CAPACITY = 1 << 20  # nodes that a tree may grow to
@@ -62,7 +63,9 @@ class SearchResult:
 
     tree: Tree
     stopped: StopReason  # of a batch, the last of them in the order above
-    history: np.ndarray  # (chunks + 1, 4): iteration, seconds, best score, nodes
+    # (chunks + 1, 6): iteration, seconds, best score, nodes, length of the best path (inf before
+    # the first) and configurations checked for collision, those of samplers included
+    history: np.ndarray
     compile_s: float
     search_s: float
     lanes: int = 32  # expansions an iteration
@@ -168,6 +171,7 @@ def search(
     time_limit_s: float = float("inf"),
     max_capacity: int = MAX_CAPACITY,
     batched: bool = False,
+    copies: int = 1,
     on_progress: Callable[[SearchState, float], Any] | None = None,
 ) -> SearchResult:
     """Grow a tree until a stopping rule holds, the time is up or the user interrupts.
@@ -183,38 +187,54 @@ def search(
         max_capacity: a full tree gets four times the room, up to so many nodes.
         batched: goal, tree, key and termination lead with an axis of Q problems; the search ends
             when all have.
-        on_progress: called with the state and the seconds so far after every chunk.
+        copies: trees that grow from the same roots at the same time, each on a thread and with a
+            key of its own. They end together, when one has reached the goal or all are done, and
+            become one tree. Not for batches.
+        on_progress: called with the best copy's state and the seconds so far after every chunk.
     """
-    state = (_initials if batched else _initial)(tree)
+    roots = int(tree.size) if copies > 1 else 0
+    states = [(_initials if batched else _initial)(tree)] * copies
+    keys = list(jax.random.split(key, copies)) if copies > 1 else [key]
     advance = partial(_chunks if batched else _chunk, world, goal, policy)
-    compile_s = _compile(advance, state, termination, key)
-    history = [_record(state, 0.0)]
+    compile_s = _compile(advance, states[0], termination, keys[0])
+    history = [_record(policy, goal, states, 0.0)]
+
+    def step(state: SearchState, key: jax.Array) -> tuple[SearchState, jax.Array]:
+        return jax.block_until_ready(advance(state, termination, key, jnp.int32(CHUNK)))
+
     started = time.perf_counter()
-    with interruptible() as interrupted:
+    with interruptible() as interrupted, ThreadPoolExecutor(copies) as pool:
+        run = pool.map if copies > 1 else map
         while True:
-            state, codes = jax.block_until_ready(advance(state, termination, key, jnp.int32(CHUNK)))
+            states, codes = zip(*run(step, states, keys), strict=True)
             seconds = time.perf_counter() - started
-            history.append(_record(state, seconds))
+            history.append(_record(policy, goal, states, seconds))
             if on_progress is not None:
-                on_progress(state, seconds)
-            codes = np.atleast_1d(codes)
+                on_progress(_best_of(states), seconds)
+            codes = np.concatenate([np.atleast_1d(code) for code in codes])
+            if copies > 1 and np.any(codes == StopReason.REACHED):
+                codes = np.full(copies, StopReason.REACHED)
             if interrupted.is_set():
                 codes = np.where(codes != StopReason.REACHED, StopReason.INTERRUPTED, codes)
             elif seconds >= time_limit_s:
                 unfinished = (codes < 0) | (codes == StopReason.TREE_FULL)
                 codes = np.where(unfinished, StopReason.TIME_LIMIT, codes)
-            capacity = state.tree.parent.shape[-1]
+            capacity = states[0].tree.parent.shape[-1]
             if np.any(codes == StopReason.TREE_FULL) and capacity < max_capacity:
                 # More room, and on; compiling for the new size is no time of the search.
                 room = min(4 * capacity, max_capacity)
-                state = dataclasses.replace(state, tree=with_capacity(state.tree, room))
-                again_s = _compile(advance, state, termination, key)
+                states = [
+                    dataclasses.replace(state, tree=with_capacity(state.tree, room))
+                    for state in states
+                ]
+                again_s = _compile(advance, states[0], termination, keys[0])
                 compile_s, started = compile_s + again_s, started + again_s
             elif np.min(codes) >= 0:
                 break
     each = tuple(StopReason(code) for code in codes.tolist())
+    grown = [state.tree for state in states]
     return SearchResult(
-        tree=state.tree,
+        tree=joined(grown, roots) if copies > 1 else grown[0],
         stopped=max(each),
         stopped_each=each,
         history=np.array(history),
@@ -224,13 +244,13 @@ def search(
     )
 
 
-def no_search(policy: ExpansionPolicy, tree: Tree) -> SearchResult:
+def no_search(policy: ExpansionPolicy, goal: Any, tree: Tree) -> SearchResult:
     """The search of a plan that has nothing to search for: it starts at its goal."""
     return SearchResult(
         tree=tree,
         stopped=StopReason.REACHED,
         stopped_each=(StopReason.REACHED,),
-        history=np.array([_record(_initial(tree), 0.0)]),
+        history=np.array([_record(policy, goal, [_initial(tree)], 0.0)]),
         compile_s=0.0,
         lanes=policy.lanes,
         search_s=0.0,
@@ -246,12 +266,30 @@ def _compile(
     return time.perf_counter() - started
 
 
-def _record(state: SearchState, seconds: float) -> tuple[float, float, float, float]:
+def _best_of(states: Sequence[SearchState]) -> SearchState:
+    if len(states) == 1:
+        return states[0]
+    return min(states, key=lambda state: float(jnp.min(state.tree.score)))
+
+
+def _record(
+    policy: ExpansionPolicy, goal: Any, states: Sequence[SearchState], seconds: float
+) -> tuple[float, ...]:
     """A row of the history; of a batch, the problem that is furthest from its goal."""
-    iteration, best, size = (float(number) for number in jax.device_get(_summary(state.tree)))
-    return iteration, seconds, best, size
+    rows = [jax.device_get(_summary(policy, goal, state.tree)) for state in states]
+    iteration, best, nodes, cost, checked = np.array(rows, float).T
+    return iteration.sum(), seconds, best.min(), nodes.sum(), cost.min(), checked.sum()
 
 
 @jax.jit
-def _summary(tree: Tree) -> tuple[jax.Array, jax.Array, jax.Array]:
-    return jnp.max(tree.iteration), jnp.max(jnp.min(tree.score, axis=-1)), jnp.max(tree.size)
+def _summary(policy: ExpansionPolicy, goal: Any, tree: Tree) -> tuple[jax.Array, ...]:
+    cost = getattr(policy, "path_cost", path_cost)
+    if tree.iteration.ndim:
+        cost = jax.vmap(cost)
+    return (
+        jnp.max(tree.iteration),
+        jnp.max(jnp.min(tree.score, axis=-1)),
+        jnp.max(tree.size),
+        jnp.max(cost(tree, goal.threshold)),
+        jnp.max(tree.checked),
+    )

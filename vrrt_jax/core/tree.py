@@ -1,6 +1,7 @@
 """The tree: allocation, insertion, nearest neighbors and the way back to the root."""
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, TypeVar
 
@@ -49,6 +50,7 @@ def create(
         size=jnp.int32(roots),
         iteration=jnp.int32(0),
         rejected=jnp.zeros(len(Rejection), jnp.int32),
+        checked=jnp.int32(0),
         payload=jax.tree.map(lambda leaf: padded(leaf, 0), payload),
     )
 
@@ -180,14 +182,67 @@ def with_capacity(tree: Tree[Payload], capacity: int) -> Tree[Payload]:
     )
 
 
+def joined(grown: Sequence[Tree[Payload]], roots: int) -> Tree[Payload]:
+    """One tree of several of the same capacity that grew from the same roots; on the host.
+
+    Args:
+        grown: the trees.
+        roots: how many of their first nodes are their roots.
+    """
+    first = grown[0]
+    sizes = [int(tree.size) for tree in grown]
+    more = [size - roots for size in sizes]  # nodes besides the roots
+    begin = roots + np.cumsum([0, *more[:-1]])  # where those of each tree go
+    capacity = first.capacity * len(grown)
+
+    def joined_column(*columns: jax.Array, fill: Any = 0) -> jax.Array:
+        rows = [np.asarray(columns[0])[:roots]]
+        rows += [
+            np.asarray(column)[roots:size] for column, size in zip(columns, sizes, strict=True)
+        ]
+        whole = np.concatenate(rows)
+        width = [(0, capacity - len(whole)), *[(0, 0)] * (whole.ndim - 1)]
+        return jnp.asarray(np.pad(whole, width, constant_values=fill))
+
+    parents = [
+        np.where(np.asarray(tree.parent) < roots, tree.parent, tree.parent - roots + place)
+        for tree, place in zip(grown, begin, strict=True)
+    ]
+    return dataclasses.replace(
+        first,
+        q=joined_column(*(tree.q for tree in grown)),
+        parent=joined_column(*parents, fill=-1),
+        cost=joined_column(*(tree.cost for tree in grown)),
+        score=joined_column(*(tree.score for tree in grown), fill=np.inf),
+        size=jnp.int32(roots + sum(more)),
+        iteration=sum(tree.iteration for tree in grown),
+        rejected=sum(tree.rejected for tree in grown),
+        checked=sum(tree.checked for tree in grown),
+        payload=jax.tree.map(joined_column, *(tree.payload for tree in grown)),
+    )
+
+
 def branch_path(tree: Tree, index: int) -> np.ndarray:
     """The path (P, D) to a node from the root that it hangs on."""
     return np.asarray(tree.q)[lineage(tree, index)]
 
 
-def best_path(tree: Tree) -> np.ndarray | None:
-    """The path (P, D) from the start, node 0, to the best node; None if no edges join them."""
-    best = int(np.argmin(tree.score))
+def best_node(tree: Tree, threshold: Array | float = 0.0) -> jax.Array:
+    """The cheapest node () i32 with a score of at most ``threshold``, or that of the best score."""
+    enough = jnp.maximum(jnp.min(tree.score), threshold)
+    return jnp.argmin(jnp.where(tree.score <= enough, tree.cost, jnp.inf)).astype(jnp.int32)
+
+
+def path_cost(tree: Tree, threshold: Array | float) -> jax.Array:
+    """Length () of the path to :func:`best_node`; inf if its score is higher or no path is."""
+    best = best_node(tree, threshold)
+    reached = (tree.score[best] <= threshold) & (tree.cost[best] < UNREACHED)
+    return jnp.where(reached, tree.cost[best], jnp.inf)
+
+
+def best_path(tree: Tree, threshold: float = 0.0) -> np.ndarray | None:
+    """The path (P, D) from the start, node 0, to :func:`best_node`; None if no edges join them."""
+    best = int(best_node(tree, threshold))
     return branch_path(tree, best) if lineage(tree, best)[0] == 0 else None
 
 

@@ -29,6 +29,7 @@ from vrrt_jax.splat.lanes import map_lanes
 from vrrt_jax.splat.types import Camera, SplatModel
 from vrrt_jax.visual.distinct import distinct
 from vrrt_jax.visual.goal import CloseUp
+from vrrt_jax.visual.twins import twins
 
 LINEARIZE_BATCH = 4  # configurations in one call: with their differences, a batch of renders
 CLOSE_UP_BATCH = 2  # the same at a close-up: few ends are left, and each core takes some
@@ -38,6 +39,7 @@ LEAST_TOLD = 1e-3  # of a threshold per rad^2; joints that raise the loss by les
 RIDGE = 1e-7  # keeps joints that no pixel sees where they are
 MAX_STEP = 0.3  # [rad] of one step of a joint
 FEWEST_MOVED = 0.2  # share of its joints that a sample moves, at least, on average
+TWINNED = 2  # best ends whose kinematic twins are looked at
 TURNS = 12  # in which the last joint goes all the way round
 SPREAD_DECAY = 0.5  # how far samples spread in a round, in units of the round before
 LEAST_COVERED = 0.01  # share of a close-up; a hand that is hidden tells nothing
@@ -116,7 +118,7 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
     # The fine image, from every minimum over a whole turn of the last joint.
     turned = _turns_of_last_hinge(world, fine, q, config.kept)
     ends = _descend(lambda q: _linearize(world, fine, q), turned, config.steps)
-    kept = _distinct_ends(world, ends, config.kept)
+    kept = _with_twins(world, fine, _distinct_ends(world, ends, config.kept), config)
     loss = kept.loss
 
     # The close-up of the hand, together with the fine image.
@@ -131,6 +133,18 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
         cost=np.where(kept.free, kept.cost, np.inf),
         uncertainty=joint_uncertainty(informed, polishing.threshold),
     )
+
+
+def _with_twins(
+    world: World, goal: PriorGoal, ends: _GaussNewtonModel, config: PolishConfig
+) -> _GaussNewtonModel:
+    """The best of the ends and of the kinematic twins of the few best."""
+    others = twins(world, ends.q[:TWINNED])
+    if not len(others):
+        return ends
+    found = _descend(lambda q: _linearize(world, goal, q), others, config.steps)
+    both = [np.concatenate(columns) for columns in zip(ends, found, strict=True)]
+    return _distinct_ends(world, _GaussNewtonModel(*both), config.kept)
 
 
 def joint_uncertainty(matrix: np.ndarray, threshold: float) -> np.ndarray:

@@ -100,3 +100,39 @@ def test_trees_of_a_batch_grow_together(wall_world):
     )
     assert found.stopped_each == (StopReason.ITERATIONS,) * 2
     assert found.tree.q.shape == (2, 160, 7) and np.all(np.asarray(found.tree.size) > 40)
+    iteration, _, _, size, cost, checked = found.history[-1]
+    assert iteration == 6 and size == np.max(found.tree.size) and np.isinf(cost)
+    assert checked == np.max(found.tree.checked) > 6 * 32
+
+
+def test_copies_of_a_tree_grow_on_threads_into_one(wall_world):
+    goal, policy = ConfigurationGoal(q=jnp.asarray(GOAL)), RRT(goal_bias=0.0)
+
+    def run(copies, score=-1.0, iterations=5):
+        return search(
+            wall_world,
+            goal,
+            policy,
+            policy.init(wall_world, goal, START[None], 4096),
+            key=jax.random.key(0),
+            termination=make_termination(score, max_iterations=iterations),
+            copies=copies,
+        )
+
+    found, alone = run(2), run(1)
+    tree = found.tree
+    assert found.stopped is StopReason.ITERATIONS and int(tree.iteration) == 10
+    assert int(found.history[-1, 0]) == 10 and int(found.history[-1, 3]) == int(tree.size) + 1
+    assert int(alone.tree.size) < int(tree.size) < tree.capacity == 2 * 4096
+    assert int(tree.rejected.sum()) + int(tree.size) - 1 == 10 * policy.lanes
+    # One root; every other node is an edge farther from it than its parent.
+    size = int(tree.size)
+    q, parent, cost = (np.asarray(leaf)[:size] for leaf in (tree.q, tree.parent, tree.cost))
+    assert parent[0] == -1 and np.all(parent[1:] >= 0) and np.all(parent[1:] < np.arange(1, size))
+    edge = np.linalg.norm(q[1:] - q[parent[1:]], axis=1)
+    np.testing.assert_allclose(cost[1:], cost[parent[1:]] + edge, rtol=1e-4, atol=1e-5)
+    assert np.all(np.isinf(np.asarray(tree.score)[size:]))
+    np.testing.assert_array_equal(run(2).tree.q, tree.q)
+    # All end when one has arrived.
+    together = run(2, score=1e9, iterations=100)
+    assert together.stopped is StopReason.REACHED
