@@ -39,6 +39,7 @@ def summary(
         "q_goal": np.round(result.q_goal.astype(float), 6).tolist(),
         "target": np.round(result.target.astype(float), 6).tolist(),
         "alternatives": np.round(result.alternatives, 6).tolist(),
+        "match_probability": _number(round(result.match_probability, 4)),
         "joint_uncertainty": None
         if result.joint_uncertainty is None
         else np.round(result.joint_uncertainty, 4).tolist(),

@@ -86,7 +86,14 @@ def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
         "--azimuth", type=command.real(-360.0, 360.0), default=0.0, help="turn the cameras [degree]"
     )
     parser.add_argument(
-        "--light", type=command.real(0.01, 100.0), default=1.0, help="brightness of the lamp"
+        "--light", type=_light, default=1.0, help="brightness of the lamp, or side for one there"
+    )
+    parser.add_argument(
+        "--noise", type=command.real(0.0, 1.0), default=0.0, help="of goal images, of 1 for white"
+    )
+    parser.add_argument("--jpeg", type=command.whole(1, 95), help="quality of goal images")
+    parser.add_argument(
+        "--mask", default="true", choices=("true", "estimated"), help="of goal images"
     )
     parser.add_argument("--occluded", action="store_true", help="obstacles hide the robot")
     _add_engine(parser)
@@ -126,6 +133,10 @@ def _add_arm(parser: argparse.ArgumentParser) -> None:
         "--time-limit", type=command.seconds, default=60.0, help="of one search [s]"
     )
     parser.add_argument("--json", help="write results here; go on from what it holds")
+
+
+def _light(text: str) -> float | str:
+    return text if text == "side" else command.real(0.01, 100.0)(text)
 
 
 def _base(text: str) -> Any:
@@ -175,7 +186,7 @@ def _protocol(arguments: argparse.Namespace) -> int:
         scenery=Scenery(
             views=arguments.views,
             azimuth_deg=arguments.azimuth,
-            light=arguments.light,
+            **{name: getattr(arguments, name) for name in ("light", "noise", "jpeg", "mask")},
             occluded=arguments.occluded,
         ),
         **chosen,

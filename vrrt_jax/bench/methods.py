@@ -70,6 +70,7 @@ class Attempt:
     refused: int = 0  # paths that the exact check refused while planning
     ambiguous: bool = False  # it said that other poses look the same
     tree_share: float | None = None  # of its path, what its tree led along
+    match_probability: float | None = None  # how sure it said it was of the pose
 
 
 def solve(
@@ -148,6 +149,7 @@ def solve(
             and (attempt.has_path or not collisions)
         ),
         "tree_share": attempt.tree_share,
+        "match_probability": attempt.match_probability,
         "mean_error_rad": round(float(error.mean()), 5),
         "max_error_rad": round(float(error.max()), 5),
         "l2_error_rad": round(float(np.linalg.norm(error)), 5),
@@ -193,7 +195,12 @@ def _plan(inputs, key, config: PlannerConfig, masks, guess) -> Attempt:
         refused=result.refused,
         ambiguous=len(result.alternatives) > 0,
         tree_share=round(result.tree_share, 4),
+        match_probability=_finite(result.match_probability),
     )
+
+
+def _finite(value: float) -> float | None:
+    return round(value, 4) if np.isfinite(value) else None
 
 
 def _baseline(inputs, robot_name: str, task: Task, method: str, key, masks) -> Attempt:

@@ -130,8 +130,12 @@ def _unusual(scenery: dict[str, Any]) -> list[str]:
     said = {
         "two views": scenery["views"] == 2,
         "occluded": scenery["occluded"],
-        f"light {scenery['light']:g}": scenery["light"] != 1.0,
+        f"light {scenery['light']}": scenery["light"] != 1.0,
         f"azimuth {scenery['azimuth_deg']:g}": scenery["azimuth_deg"] != 0.0,
+        # Older files do not say how images were taken.
+        f"noise {scenery.get('noise')}": bool(scenery.get("noise")),
+        f"JPEG {scenery.get('jpeg')}": scenery.get("jpeg") is not None,
+        "estimated mask": scenery.get("mask") == "estimated",
     }
     return [name for name, holds in said.items() if holds]
 
@@ -159,7 +163,10 @@ def _command(results: dict[str, Any]) -> str:
     scenery = results["scenery"]
     words += ["--views 2"] if scenery["views"] == 2 else []
     words += ["--occluded"] if scenery["occluded"] else []
-    words += [f"--light {scenery['light']:g}"] if scenery["light"] != 1.0 else []
+    words += [f"--light {scenery['light']}"] if scenery["light"] != 1.0 else []
+    words += [f"--noise {scenery['noise']}"] if scenery.get("noise") else []
+    words += [f"--jpeg {scenery['jpeg']}"] if scenery.get("jpeg") is not None else []
+    words += ["--mask estimated"] if scenery.get("mask") == "estimated" else []
     words += [f"--azimuth {scenery['azimuth_deg']:g}"] if scenery["azimuth_deg"] else []
     if results.get("problems"):
         words += ["--problems DIR"]

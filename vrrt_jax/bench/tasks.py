@@ -26,6 +26,7 @@ from vrrt_jax.scene.world import (
 from vrrt_jax.splat.camera import orbit
 from vrrt_jax.splat.images import View
 from vrrt_jax.splat.mujoco_images import MeshRenderer, Picture
+from vrrt_jax.splat.photographs import Photograph, photograph
 from vrrt_jax.splat.types import Camera
 
 ROBOTS = ("panda", "ur5e", "fetch")
@@ -36,6 +37,8 @@ IMAGE_PX = 480
 AZIMUTHS_DEG = (180.0, 90.0)  # of the first and the second view: from the front, from the right
 ELEVATION_DEG = -30.0
 DISTANCE = 2.1  # of the camera, in radii of the workspace
+SIDE = "side"  # the light of a lamp far away, to the left of the robot
+SHINES = (0.0, -0.87, -0.5)  # where that lamp shines
 RANDOM = "random"  # the level of pairs drawn anywhere inside the limits
 
 
@@ -45,8 +48,17 @@ class Scenery:
 
     views: int = 1
     azimuth_deg: float = 0.0  # added to the cameras' own
-    light: float = 1.0  # brightness of the lamp
+    light: float | str = 1.0  # brightness of the lamp on the camera; or SIDE, for one elsewhere
+    noise: float = 0.0  # standard deviation of each channel of each pixel, of 1 for white
+    jpeg: int | None = None  # quality of the file
+    mask: str = "true"  # or "estimated", from a plain background
     occluded: bool = False  # obstacles are drawn, and the pixels that they take masked out
+
+    @property
+    def photograph(self) -> Photograph:
+        """How the goal images are taken."""
+        brightness = 1.0 if isinstance(self.light, str) else self.light
+        return Photograph(brightness=brightness, noise=self.noise, jpeg=self.jpeg, mask=self.mask)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -196,18 +208,20 @@ def goal_images(
     """Images (H, W, 4) of the robot at the goal, and masks (H, W) of what may be compared.
 
     Raises:
-        ValueError: the robot's meshes are not on this machine.
+        ValueError: the robot's meshes are not on this machine, or a light or mask is unknown.
         RuntimeError: OpenGL is not available.
     """
     world = bench_world(robot_name, task.world)
     # The floor is behind the robot, and as plain a background as any.
     standing = tuple(o for o in obstacle_list(world) if o.kind != "plane")
     hiding = standing if scenery.occluded else ()
-    renderer = _renderer(robot_name, hiding, scenery.light)
+    renderer = _renderer(robot_name, hiding, scenery.light == SIDE)
+    rng = np.random.default_rng([task.index, zlib.crc32(f"{task.level:.3f}".encode())])
     images, masks = [], []
     for camera in cameras(robot_name, scenery):
         picture = renderer.picture(task.q_goal, camera)
-        images.append(np.concatenate([picture.rgb, picture.alpha[..., None]], axis=-1))
+        rgb, alpha = photograph(picture, scenery.photograph, rng)
+        images.append(np.concatenate([rgb, alpha[..., None]], axis=-1))
         masks.append(picture.valid)
     # The robot comes over black; a goal image has straight colors beside its mask.
     for image in images:
@@ -217,7 +231,7 @@ def goal_images(
 
 
 @functools.lru_cache(maxsize=2)
-def _renderer(robot_name: str, hiding: tuple[Obstacle, ...], light: float) -> MeshRenderer:
+def _renderer(robot_name: str, hiding: tuple[Obstacle, ...], from_side: bool) -> MeshRenderer:
     robot = bench_robot(robot_name)
     spec = mesh_spec(robot)
     if spec is None:
@@ -225,7 +239,7 @@ def _renderer(robot_name: str, hiding: tuple[Obstacle, ...], light: float) -> Me
             f"goal images need the meshes of '{robot_name}', which are not on this machine: pip "
             f"install {install_hint(robot.mesh_source)}"
         )
-    return MeshRenderer(spec, hiding, light=light)
+    return MeshRenderer(spec, hiding, shines=SHINES if from_side else None)
 
 
 def image_psnr(
@@ -255,7 +269,10 @@ def image_psnr(
 def robot_views(
     robot_name: str, q: np.ndarray, scenery: Scenery, masks: list[np.ndarray] | None = None
 ) -> list[View]:
-    """The true meshes at ``q`` (D,) in each view, with nothing before them, where masks say so."""
+    """The true meshes at ``q`` (D,) in each view, with nothing before them, where masks say so.
+
+    They are drawn in the light of the goal images, as bright as in training and without noise.
+    """
     views = []
     for index, picture in enumerate(_pictures(robot_name, q, scenery)):
         valid = np.ones_like(picture.alpha) if masks is None else masks[index].astype(np.float32)
@@ -271,5 +288,5 @@ def robot_views(
 
 
 def _pictures(robot_name: str, q: np.ndarray, scenery: Scenery) -> list[Picture]:
-    renderer = _renderer(robot_name, (), scenery.light)
+    renderer = _renderer(robot_name, (), scenery.light == SIDE)
     return [renderer.picture(q, camera) for camera in cameras(robot_name, scenery)]

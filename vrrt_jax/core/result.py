@@ -80,6 +80,8 @@ class PlanResult:
     # (D,) how far each joint of the target may be off while the image still matches, the others
     # following [rad] or [m], at most pi; None where nothing tells.
     joint_uncertainty: np.ndarray | None = None
+    # How likely the target is the pose that a goal image shows, 0 to 1; NaN where nothing tells.
+    match_probability: float = float("nan")
     # Of the length of ``raw_path``, what ``tree`` and an edge from it led along. RRT-Connect, which
     # goes on from the tree where no such edge is free, found the rest.
     tree_share: float = 1.0

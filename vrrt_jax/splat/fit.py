@@ -17,6 +17,7 @@ import numpy as np
 
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots.mesh_sources import mesh_file
+from vrrt_jax.splat.calibrate import calibrate
 from vrrt_jax.splat.fit_config import FitConfig, LevelConfig, check_fit_config
 from vrrt_jax.splat.fit_level import fit_level
 from vrrt_jax.splat.model import Level, SelfModel, save_self_model
@@ -83,7 +84,7 @@ def fit_self_model(
     images = _cached_images(robot, spec, config, work, seed, outermost(points))
     close_up = fit(images, config.close_up, "close_up")
 
-    model = SelfModel(
+    uncalibrated = SelfModel(
         robot=robot.name,
         joint_names=robot.joint_names,
         levels=tuple(levels),
@@ -97,6 +98,7 @@ def fit_self_model(
             "versions": {"jax": jax.__version__, "mujoco": mujoco.__version__},
         },
     )
+    model = calibrate(robot, spec, uncalibrated, seed=seed + 2, config=config)
     save_self_model(model, path)
     for file in work.iterdir():
         file.unlink()

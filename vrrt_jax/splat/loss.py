@@ -1,4 +1,10 @@
-"""The loss of a rendered robot against a goal image: a mean squared error."""
+"""The loss of a rendered robot against a goal image, in whatever light that was taken.
+
+A self-model is trained under one lamp, and nobody knows the lamp of a goal image. Each color
+channel of a render is therefore scaled by the gain that suits the goal best, in closed form, and
+what would be brighter than white is white. Shading remains: a lamp from the side darkens the other
+side. Colors therefore count less than coverage, which no lamp changes.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +14,11 @@ from vrrt_jax.splat.raster import render
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
 from vrrt_jax.splat.windows import Windows
 
+COLOR_WEIGHT = 0.01  # of a squared color error, relative to the goal's brightness, beside coverage
+OVEREXPOSED = 0.97  # from which on a pixel may have been brighter than the image can say
+FEW_PIXELS = 1e-4  # share of an image that tells no gain; without more, the gain is near 1
+DARKEST = 0.02  # mean brightness of a robot, below which its noise is not scaled up any more
+
 
 def image_loss(
     rgb: jax.Array,
@@ -16,7 +27,7 @@ def image_loss(
     goal_alpha: jax.Array,
     valid: jax.Array,
 ) -> jax.Array:
-    """Mean squared error of one view, over the valid pixels and the four channels.
+    """Mean squared error of one view in the light of training, over the four channels.
 
     Args:
         rgb: (H, W, 3) the rendered robot over black.
@@ -32,6 +43,30 @@ def image_loss(
     return jnp.sum(valid * error) / (4.0 * jnp.maximum(jnp.sum(valid), 1.0))
 
 
+def relit(
+    rgb: jax.Array,
+    alpha: jax.Array,
+    goal_rgb: jax.Array,
+    goal_alpha: jax.Array,
+    valid: jax.Array,
+) -> jax.Array:
+    """A render in the light of the goal: one gain for each color channel.
+
+    The gains are those of least squares over pixels that both cover and that are not overexposed in
+    the goal. They move with the render, and gradients go through them. Arguments are those of
+    :func:`image_loss`.
+
+    Returns:
+        (H, W, 3) the rendered robot over black.
+    """
+    exposed = goal_rgb < OVEREXPOSED * goal_alpha[..., None]
+    weight = jnp.where(exposed, (valid * alpha * goal_alpha)[..., None], 0.0)
+    few = FEW_PIXELS * alpha.size
+    across = jnp.sum(weight * rgb * goal_rgb, axis=(0, 1)) + few
+    gain = across / (jnp.sum(weight * rgb**2, axis=(0, 1)) + few)
+    return jnp.minimum(gain * rgb, alpha[..., None])
+
+
 def goal_loss(
     chain: Chain,
     splats: SplatModel,
@@ -40,7 +75,7 @@ def goal_loss(
     q: jax.Array,
     windows: Windows | None = None,
 ) -> jax.Array:
-    """Loss of a configuration: the mean over the V views.
+    """Loss of a configuration: weighted squared errors of color and alpha, the mean over V views.
 
     Args:
         chain: the robot's kinematics.
@@ -53,12 +88,8 @@ def goal_loss(
     Returns:
         ().
     """
-    views = _render_views(chain, splats, cameras, q, windows)
-    losses = [
-        image_loss(rgb, alpha, goal.rgb[view], goal.alpha[view], goal.valid[view])
-        for view, (rgb, alpha) in enumerate(views)
-    ]
-    return jnp.mean(jnp.stack(losses))
+    image = weighted_image(chain, splats, cameras, goal, q, windows)
+    return jnp.sum((image - weighted_goal(goal)) ** 2)
 
 
 def _render_views(
@@ -84,13 +115,26 @@ def weighted_image(
     Arguments are those of :func:`goal_loss`.
 
     Returns:
-        (V * H * W * 4,) colors and alphas, times the root of each pixel's weight.
+        (V * H * W * 4,), see :func:`weighted`.
     """
-    views = [
-        jnp.concatenate([rgb, alpha[..., None]], axis=-1)
-        for rgb, alpha in _render_views(chain, splats, cameras, q, windows)
-    ]
-    return (jnp.stack(views) * _root_weight(goal)).ravel()
+    views = _render_views(chain, splats, cameras, q, windows)
+    return weighted(jnp.stack([rgb for rgb, _ in views]), jnp.stack([a for _, a in views]), goal)
+
+
+def weighted(rgb: jax.Array, alpha: jax.Array, goal: GoalImage) -> jax.Array:
+    """Images as a vector for least squares, in the light of the goal.
+
+    Args:
+        rgb: (V, H, W, 3) the robot over black.
+        alpha: (V, H, W).
+        goal: V images.
+
+    Returns:
+        (V * H * W * 4,) colors and alphas, times the root of each one's weight.
+    """
+    rgb = jax.vmap(relit)(rgb, alpha, goal.rgb, goal.alpha, goal.valid)
+    image = jnp.concatenate([rgb, alpha[..., None]], axis=-1)
+    return (image * _root_weight(goal)).ravel()
 
 
 def weighted_goal(goal: GoalImage) -> jax.Array:
@@ -100,9 +144,17 @@ def weighted_goal(goal: GoalImage) -> jax.Array:
 
 
 def _root_weight(goal: GoalImage) -> jax.Array:
-    """(V, H, W, 1) root of each pixel's weight in the mean over views."""
-    num_valid = jnp.maximum(jnp.sum(goal.valid, axis=(1, 2), keepdims=True), 1.0)
-    return jnp.sqrt(goal.valid / (4.0 * num_valid * len(goal.valid)))[..., None]
+    """(V, H, W, 4) root of each number's weight in the mean over views.
+
+    Errors of color are relative to the robot's mean brightness in each view.
+    """
+    num_valid = jnp.maximum(jnp.sum(goal.valid, axis=(1, 2)), 1.0)
+    covered = jnp.maximum(jnp.sum(goal.valid * goal.alpha, axis=(1, 2)), 1e-6)
+    brightness = jnp.sum(goal.valid[..., None] * goal.rgb, axis=(1, 2, 3)) / (3.0 * covered)
+    color = COLOR_WEIGHT / jnp.maximum(brightness, DARKEST) ** 2
+    channels = jnp.stack([color, color, color, jnp.ones_like(color)], axis=-1)
+    pixel = goal.valid / (4.0 * len(goal.valid) * num_valid[:, None, None])
+    return jnp.sqrt(pixel[..., None] * channels[:, None, None])
 
 
 def psnr_db(mean_squared_error: float) -> float:

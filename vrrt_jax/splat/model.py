@@ -36,7 +36,7 @@ class Level:
     size_px: int  # image height that it was trained at [px]
     psnr_db: float  # on unseen poses and cameras, over RGB and alpha
     # The loss divided by the share of the image that the robot covers. 95 % of correct poses have a
-    # lower one.
+    # lower one, in whatever light the image is taken.
     match_threshold: float
 
 

@@ -50,13 +50,14 @@ class _Own(threading.local):
 class MeshRenderer:
     """Renders a robot's meshes at given configurations with given cameras, in any thread.
 
-    The only light sits on the camera, with almost no highlights.
+    The only lamp sits on the camera, or shines from far away, with almost no highlights.
 
     Args:
         spec: the robot with its visual meshes; it is compiled here.
         obstacles: drawn by :meth:`scene`; in :meth:`picture` they only hide the robot.
         attached: what the robot holds, drawn likewise.
-        light: brightness of the lamp; 1 is what self-models are trained with.
+        shines: (3,) direction in the world of a lamp far away. Without it the lamp is on the
+            camera, as in training.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class MeshRenderer:
         obstacles: Sequence[Obstacle] = (),
         attached: Sequence[HeldObject] = (),
         *,
-        light: float = 1.0,
+        shines: Sequence[float] | None = None,
     ):
         """Compile the model; raises RuntimeError if OpenGL is not available."""
         spec = spec.copy()
@@ -81,9 +82,7 @@ class MeshRenderer:
                 rgba=obstacle.rgba,
                 group=OBSTACLE_GROUP,
             )
-        headlight = spec.visual.headlight
-        headlight.ambient, headlight.diffuse = [0.35 * light] * 3, [0.6 * light] * 3
-        headlight.specular = [0.02] * 3
+        _place_lamp(spec, shines)
         spec.visual.quality.shadowsize = 0
         spec.visual.quality.offsamples = 0
         spec.visual.global_.offwidth = spec.visual.global_.offheight = MAX_RENDER_PX
@@ -191,6 +190,24 @@ class MeshRenderer:
                     f"({error}); install libosmesa6 (or libegl1 and libgl1), or set MUJOCO_GL"
                 ) from None
         return renderers[size]
+
+
+def _place_lamp(spec: mujoco.MjSpec, shines: Sequence[float] | None) -> None:
+    """Give the scene its only lamp; what comes from everywhere is the same for both kinds."""
+    headlight = spec.visual.headlight
+    ambient, diffuse, specular = [0.35] * 3, [0.6] * 3, [0.02] * 3
+    headlight.ambient, headlight.diffuse, headlight.specular = ambient, diffuse, specular
+    if shines is None:
+        return
+    headlight.diffuse, headlight.specular = [0.0] * 3, [0.0] * 3
+    spec.worldbody.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        dir=list(shines),
+        ambient=[0.0] * 3,
+        diffuse=diffuse,
+        specular=specular,
+        castshadow=False,
+    )
 
 
 def _close(renderers: _Renderers, thread: threading.Thread) -> None:

@@ -63,7 +63,7 @@ def render_images(
     body_link = body_links(renderer.model)
     rng = np.random.default_rng(seed)
     q = random_configurations(robot, num, rng)
-    cameras = _random_cameras(robot, config, q, tip, rng)
+    cameras = random_cameras(robot, config, q, tip, rng)
     rgb = np.zeros((num, cameras[0].height, cameras[0].width, 3), np.float16)
     alpha = np.zeros(rgb.shape[:3], np.float16)
     points = []
@@ -145,7 +145,7 @@ def random_configurations(robot, num: int, rng: np.random.Generator) -> np.ndarr
     return found[:num]
 
 
-def _random_cameras(
+def random_cameras(
     robot, config: FitConfig, q: np.ndarray, tip, rng: np.random.Generator
 ) -> list[Camera]:
     """A camera for each configuration (n, D): of the whole robot, or of the tip."""

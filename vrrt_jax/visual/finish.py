@@ -16,6 +16,7 @@ from vrrt_jax.core.types import ExpansionPolicy
 from vrrt_jax.outcome import Chosen, finish, time_left
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.world import World, checked_more_finely, with_margin
+from vrrt_jax.visual.certainty import match_probability
 from vrrt_jax.visual.distinct import distances_to, distinct
 from vrrt_jax.visual.join import Way, connect, join
 from vrrt_jax.visual.lineages import LineageRRT
@@ -114,8 +115,12 @@ def finish_visual(
     uncertainty = None if ends.uncertainty is None else ends.uncertainty[end]
     if result.ok and uncertainty is not None:
         result = dataclasses.replace(result, advice=_untold(robot, uncertainty))
+    probability = float("nan")
+    if uncertainty is not None and np.isfinite(ends.cost[end]):
+        probability = match_probability(loss, ends.threshold, ends.cost, end, uncertainty)
     return dataclasses.replace(
         result,
+        match_probability=probability,
         alternatives=ends.q[alike],
         joint_uncertainty=uncertainty,
         search_match_threshold=search_threshold,

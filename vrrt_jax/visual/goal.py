@@ -37,7 +37,7 @@ class ImageObjective(LeastSquaresGoal):
     threshold: Any  # () loss of a match
 
     def loss(self, world: Any, q: jax.Array) -> jax.Array:
-        """Mean squared error () of the rendered configuration (D,)."""
+        """Weighted squared errors () of the rendered configuration (D,), in the goal's light."""
         return goal_loss(world.chain, self.splats, self.cameras, self.image, q, self.windows)
 
     def prediction(self, world: Any, q: jax.Array) -> jax.Array:
@@ -73,8 +73,8 @@ class ImageGoal:
     # (H, W) bool, or 0 and 1, or 0 and 255: true for the pixels that are compared, where not all
     # are; or V of them
     mask: np.ndarray | Sequence[np.ndarray] | None = None
-    # A subclass may change the loss. The threshold stays the one that is calibrated for the mean
-    # squared error, times the setting match.scale.
+    # A subclass may change the loss. The threshold stays the one that is calibrated for the loss of
+    # ImageObjective, times the setting match.scale.
     objective: type[ImageObjective] = ImageObjective
 
     @property

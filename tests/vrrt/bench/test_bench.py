@@ -85,6 +85,21 @@ def test_occluded_pixels_are_masked(near_task):
     np.testing.assert_allclose(hidden[0][masks[0]], plain[0][masks[0]], atol=0.02)
 
 
+def test_goal_images_are_taken_as_told(near_task):
+    def taken(**scenery):
+        return tasks.goal_images("panda", near_task, tasks.Scenery(**scenery))[0][0]
+
+    plain, half, side = taken(), taken(light=0.5), taken(light="side")
+    inside = plain[..., 3] == 1
+    np.testing.assert_allclose(half[inside], plain[inside] * [0.5, 0.5, 0.5, 1.0], atol=1e-6)
+    np.testing.assert_array_equal(side[..., 3], plain[..., 3])
+    assert np.abs(side - plain)[inside].max() > 0.3
+    rough = taken(noise=0.05, jpeg=60, mask="estimated")
+    np.testing.assert_array_equal(rough, taken(noise=0.05, jpeg=60, mask="estimated"))
+    assert 0.01 < np.abs(rough - plain)[inside].mean() < 0.1
+    assert set(np.unique(rough[..., 3])) == {0.0, 1.0}
+
+
 def test_psnr_is_highest_at_the_goal(near_task):
     scenery = tasks.Scenery(views=2)
     images, _ = tasks.goal_images("panda", near_task, scenery)

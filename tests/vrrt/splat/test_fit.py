@@ -52,6 +52,7 @@ def test_a_small_self_model_is_trained_and_resumed(arm, tmp_path, monkeypatch):
     assert len(restored) == 1 and not rendered  # the level and the images that were done
     assert not path.with_name("arm.npz.work").exists()
     assert model.levels[0].psnr_db > 22 and model.close_up.psnr_db > 18
+    assert all(0 < level.match_threshold < 0.5 for level in (*model.levels, model.close_up))
     assert load_self_model(path).close_up.match_threshold == model.close_up.match_threshold
 
 

@@ -41,7 +41,7 @@ def test_ambiguous_goals_are_told(panda, self_model, camera, open_world):
     found = finished(policy.init(open_world, problem.goal, roots, config.tree.capacity))
     args = (panda, open_world, problem, policy, found, Q_START, jax.random.key(0), config)
     result = finish.finish_visual(*args)
-    assert result.ok
+    assert result.ok and result.match_probability > 0.5
     np.testing.assert_allclose(result.target, Q_GOAL, atol=0.02)
     assert len(result.alternatives) == 0  # an exact image tells them apart
     with pytest.MonkeyPatch.context() as patch:

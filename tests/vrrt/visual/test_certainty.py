@@ -1,0 +1,35 @@
+"""How sure a match is: what raises the probability, and where it ends."""
+
+import numpy as np
+import pytest
+
+from vrrt_jax.visual.certainty import match_probability
+
+SURE = {"loss": 0.3, "cost": np.array([1.0, 8.0]), "uncertainty": np.array([0.1, 0.05])}
+
+
+def probability(**changes):
+    found = {**SURE, **changes}
+    return match_probability(found["loss"], 1.0, found["cost"], 0, found["uncertainty"])
+
+
+def test_a_good_match_far_ahead_is_sure():
+    assert probability() > 0.9
+    assert probability(cost=np.array([1.0])) >= probability()  # without any rival
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"loss": 3.0},
+        {"cost": np.array([1.0, 1.05])},
+        {"uncertainty": np.array([0.1, 2.0])},
+    ],
+    ids=["a worse match", "a rival nearly as good", "a joint that may be off"],
+)
+def test_what_makes_a_match_doubtful(change):
+    assert 0.0 < probability(**change) < probability()
+
+
+def test_rivals_in_collision_are_none():
+    assert probability(cost=np.array([1.0, np.inf])) == probability(cost=np.array([1.0]))
