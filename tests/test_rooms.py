@@ -17,7 +17,7 @@ VRRT_ROOMS = (
     ("visual",),
     ("attempts", "joint"),
     ("planner", "problems"),
-    ("report", "viz"),
+    ("report", "viz", "viewer"),
     ("bench",),
     ("cli",),
 )
@@ -29,7 +29,7 @@ NRP_ROOMS = (
     ("samplers",),
     ("planners",),
     ("planner", "problems"),
-    ("viz",),
+    ("viz", "viewer"),
     ("bench",),
     ("cli",),
 )

@@ -52,6 +52,7 @@ from vrrt_jax.splat.model import SelfModel, load_self_model, save_self_model  # 
 from vrrt_jax.splat.picture_file import read_image, write_image  # noqa: E402
 from vrrt_jax.splat.raster import render  # noqa: E402
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel  # noqa: E402
+from vrrt_jax.viewer import view  # noqa: E402
 from vrrt_jax.visual.goal import ImageGoal, ImageObjective  # noqa: E402
 from vrrt_jax.visual.policy import VisualRRT  # noqa: E402
 
@@ -121,6 +122,7 @@ __all__ = [
     "search",
     "static",
     "verify_path",
+    "view",
     "with_obstacles",
     "write_image",
 ]

@@ -1,4 +1,4 @@
-"""The ``vrrt`` command: plan, render, fit, spheres, bench, report, worlds."""
+"""The ``vrrt`` command: plan, view, render, fit, spheres, bench, report, worlds."""
 
 import argparse
 import json
@@ -43,6 +43,11 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--capacity", type=command.whole(8, 1 << 20), help="nodes of the tree")
     plan.add_argument("--out", default="out", help="folder for the results")
     plan.add_argument("--no-pictures", action="store_true", help="no figure and no animation")
+
+    view = commands.add_parser("view", help="show a plan in the browser")
+    view.set_defaults(run=_view)
+    view.add_argument("folder", help="what vrrt plan wrote with --out")
+    command.add_port(view)
 
     render = commands.add_parser("render", help="make a goal image with MuJoCo's renderer")
     render.set_defaults(run=_render, out_is_file=True)
@@ -138,10 +143,19 @@ def _plan(arguments: argparse.Namespace) -> int:
     return EXIT_SOLVED if result.ok else EXIT_UNSOLVED
 
 
+def _view(arguments: argparse.Namespace) -> int:
+    from vrrt_jax import viewer
+
+    page = viewer.view_folder(Path(arguments.folder), port=arguments.port)
+    print(f"{page.url} shows {arguments.folder}; Ctrl-C ends it", flush=True)
+    page.serve()
+    return EXIT_SOLVED
+
+
 def _pictures(problem, result, out: Path) -> None:
     from vrrt_jax import viz
 
-    written = ["result.json", "path.npz"]
+    written = ["result.json", "path.npz", "tree.npz"]
     try:
         viz.save_figure(problem, result, out / "figure.png")
         written.append("figure.png")
@@ -280,8 +294,9 @@ def _report(arguments: argparse.Namespace) -> int:
 
 
 def _worlds(arguments: argparse.Namespace) -> int:
-    from vrrt_jax.bench.worlds import random_world, write_world
+    from vrrt_jax.bench.worlds import random_world
     from vrrt_jax.robots import load_robot
+    from vrrt_jax.scene.obstacles import write_obstacles
 
     robot, out = (
         load_robot(arguments.robot, freeze=arguments.freeze),
@@ -290,7 +305,7 @@ def _worlds(arguments: argparse.Namespace) -> int:
     for k in range(1, arguments.num + 1):
         seed = arguments.seed + k
         comment = f"Written by the command `vrrt worlds --robot {robot.name}`, seed {seed}."
-        write_world(random_world(robot, seed), out / f"{robot.name}_{k}.xml", comment)
+        write_obstacles(random_world(robot, seed), out / f"{robot.name}_{k}.xml", comment)
     print(f"wrote {arguments.num} worlds to {out}")
     return EXIT_SOLVED
 

@@ -7,15 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from vrrt_jax.checks import check_limits
 from vrrt_jax.core.fields import check_fields
+from vrrt_jax.core.files import replacing
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots import Robot, load_robot, robot_names, scenes_dir
-from vrrt_jax.scene.obstacles import load_obstacles
-from vrrt_jax.scene.world import World, build_world
-from vrrt_jax.splat.camera_fields import camera_from_dict
-from vrrt_jax.splat.model import SelfModel, load_self_model
+from vrrt_jax.scene.obstacles import load_obstacles, write_obstacles
+from vrrt_jax.scene.world import World, build_world, held_names, obstacle_list
+from vrrt_jax.splat.camera_fields import camera_from_dict, camera_to_dict
+from vrrt_jax.splat.model import SelfModel, load_self_model, save_self_model
 from vrrt_jax.splat.picture_file import read_image
 from vrrt_jax.splat.types import Camera
 from vrrt_jax.visual.goal import ImageGoal
@@ -96,6 +98,41 @@ def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
         )
     except KeyError as error:
         raise ValueError(f"'{file}' lacks the field {error}; see the packaged problems") from None
+
+
+def save_problem(problem: Problem, folder: Path) -> None:
+    """Write a problem as a folder of its own, for :func:`load_problem`.
+
+    Goal images are written in 8 bits a channel. Meshes stay where they are.
+
+    Raises:
+        ValueError: the robot holds objects, which a folder has no place for.
+    """
+    if held := held_names(problem.world):
+        raise ValueError(
+            f"the robot holds {held}, which a problem's folder has no place for; detach them first"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "robot.xml").write_text(problem.robot.xml)
+    write_obstacles(obstacle_list(problem.world), folder / "world.xml")
+    save_self_model(problem.self_model, folder / "self_model.npz")
+    views = []
+    for index, image in enumerate(problem.goal_images):
+        name, pixels = f"goal_{index + 1}.png", np.round(255 * np.clip(image, 0, 1))
+        Image.fromarray(pixels.astype(np.uint8)).save(folder / name)
+        views.append({"image": name, "camera": camera_to_dict(problem.cameras[index])})
+    fields: dict[str, Any] = {
+        "robot": "robot.xml",
+        "world": "world.xml",
+        "self_model": "self_model.npz",
+        "start": np.asarray(problem.q_start, float).tolist(),
+        "views": views,
+    }
+    if problem.true_goal is not None:
+        fields["true_goal"] = np.asarray(problem.true_goal, float).tolist()
+    # The file that makes it a problem comes last.
+    with replacing(folder / "problem.json", "w") as file:
+        file.write(json.dumps(fields, indent=1) + "\n")
 
 
 @single_precision

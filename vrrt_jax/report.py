@@ -14,17 +14,33 @@ from vrrt_jax.core.edges import joint_error
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.result import PlanResult
 from vrrt_jax.core.shortcut import path_length
-from vrrt_jax.problems import Problem
+from vrrt_jax.core.tree_file import nodes_of, save_nodes
+from vrrt_jax.problems import Problem, save_problem
+from vrrt_jax.scene.world import World
 
 
 def summary(
     problem: Problem, result: PlanResult, config: PlannerConfig, seed: int
 ) -> dict[str, Any]:
     """All that there is to say about a plan, ready for JSON."""
-    check = result.verification
     fields: dict[str, Any] = {
         "problem": problem.name,
         "robot": problem.robot.name,
+        **outcome(problem.world, result),
+        "seed": seed,
+        "config": _plain(dataclasses.asdict(config)),
+        "versions": versions(),
+    }
+    if problem.true_goal is not None:
+        error = joint_error(problem.world, result.target, problem.true_goal)
+        fields["error_rad"] = {"mean": float(error.mean()), "max": float(error.max())}
+    return fields
+
+
+def outcome(world: World, result: PlanResult) -> dict[str, Any]:
+    """What the result itself says, ready for JSON."""
+    check = result.verification
+    return {
         "status": result.status.name,
         "advice": result.advice,
         "verified": bool(check is not None and check.ok),
@@ -35,7 +51,7 @@ def summary(
         "loss": result.loss,
         "goal_loss": result.match_threshold,
         "cost": result.cost,
-        "raw_cost": path_length(problem.world, result.raw_path),
+        "raw_cost": path_length(world, result.raw_path),
         "q_goal": np.round(result.q_goal.astype(float), 6).tolist(),
         "target": np.round(result.target.astype(float), 6).tolist(),
         "alternatives": np.round(result.alternatives, 6).tolist(),
@@ -51,14 +67,7 @@ def summary(
             "waypoints": len(result.path),
             "rejected": dict(result.rejected),
         },
-        "seed": seed,
-        "config": _plain(dataclasses.asdict(config)),
-        "versions": versions(),
     }
-    if problem.true_goal is not None:
-        error = joint_error(problem.world, result.target, problem.true_goal)
-        fields["error_rad"] = {"mean": float(error.mean()), "max": float(error.max())}
-    return fields
 
 
 def versions() -> dict[str, str]:
@@ -71,7 +80,11 @@ def versions() -> dict[str, str]:
 def save_result(
     problem: Problem, result: PlanResult, config: PlannerConfig, seed: int, folder: Path
 ) -> None:
-    """Write ``result.json`` and ``path.npz`` into a folder, each at once or not at all."""
+    """Write a plan's files into a folder, each at once or not at all.
+
+    These are ``result.json``, ``path.npz``, ``tree.npz``, and the folder ``problem``: all that
+    ``vrrt view`` shows.
+    """
     arrays: dict[str, Any] = {
         "path": result.path,
         "raw_path": result.raw_path,
@@ -80,6 +93,8 @@ def save_result(
     }
     with replacing(folder / "path.npz") as file:
         np.savez_compressed(file, **arrays)
+    save_nodes(nodes_of(result.tree), folder / "tree.npz")
+    save_problem(problem, folder / "problem")
     with replacing(folder / "result.json", "w") as file:
         file.write(json.dumps(summary(problem, result, config, seed), indent=2) + "\n")
 

@@ -169,7 +169,7 @@ def save_animation(
     camera = squared(problem.cameras[0])
     camera = shrunk(camera, max(1, round(camera.height / height)))
     painter = ScenePainter(problem.robot, problem.world, problem.self_model, camera)
-    goal = _over_sky(problem.goal_images[0], (camera.width, camera.height))
+    goal = over_sky(problem.goal_images[0], (camera.width, camera.height))
     separator = np.full((camera.height, 4, 3), 255, np.uint8)
     pictures = [
         Image.fromarray(np.concatenate([painter.paint(q), separator, goal], axis=1))
@@ -183,7 +183,7 @@ def save_animation(
     return painter.uses_meshes
 
 
-def _over_sky(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def over_sky(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """A goal image over the sky's color, resized: (H, W, 3) uint8."""
     image = np.asarray(image, np.float32)
     if image.shape[2] == 4:

@@ -1,8 +1,6 @@
-"""Random worlds: five to ten obstacles around a robot, as MJCF files."""
+"""Random worlds: five to ten obstacles around a robot."""
 
-import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -82,20 +80,3 @@ def _random_obstacle(
 
 def _rounded(values: Sequence[float] | np.ndarray) -> tuple:
     return tuple(round(float(value), 4) for value in values)
-
-
-def write_world(obstacles: Sequence[Obstacle], path: Path, comment: str = "") -> None:
-    """Write obstacles as an MJCF file for :func:`vrrt_jax.load_world`."""
-    root = ET.Element("mujoco", model=path.stem)
-    if comment:
-        root.append(ET.Comment(f" {comment} "))
-    body = ET.SubElement(root, "worldbody")
-    for obstacle in obstacles:
-        fields = {"pos": obstacle.position, "quat": obstacle.quaternion, "size": obstacle.size}
-        numbers = {key: " ".join(f"{v:g}" for v in value) for key, value in fields.items()}
-        color = " ".join(f"{v:g}" for v in obstacle.rgba)
-        ET.SubElement(
-            body, "geom", {"name": obstacle.name, "type": obstacle.kind, **numbers, "rgba": color}
-        )
-    ET.indent(root)
-    path.write_text(ET.tostring(root, encoding="unicode") + "\n")

@@ -161,6 +161,13 @@ def writable_folder(folder: str | Path, option: str = "--out") -> Path:
     return folder
 
 
+def add_port(parser: argparse.ArgumentParser) -> None:
+    """Add ``--port`` of a page in the browser."""
+    parser.add_argument(
+        "--port", type=whole(1, 65535), help="of 127.0.0.1; a free one if it is not given"
+    )
+
+
 def words(text: str) -> str:
     """An argument that is not empty."""
     if not text.strip() or "\0" in text:

@@ -6,6 +6,7 @@ slot holds any kind; :mod:`vrrt_jax.scene.obstacle_kinds` has the table of kinds
 
 import dataclasses
 import warnings
+import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,25 @@ def load_obstacles(path: str | Path) -> list[Obstacle]:
     for obstacle in obstacles:
         check_obstacle(obstacle)
     return obstacles
+
+
+def write_obstacles(obstacles: Sequence[Obstacle], path: Path, comment: str = "") -> None:
+    """Write obstacles as an MJCF file for :func:`load_obstacles`."""
+    root = ET.Element("mujoco", model=path.stem)
+    if comment:
+        root.append(ET.Comment(f" {comment} "))
+    body = ET.SubElement(root, "worldbody")
+    for obstacle in obstacles:
+        fields = {
+            "pos": obstacle.position,
+            "quat": obstacle.quaternion,
+            "size": obstacle.size,
+            "rgba": obstacle.rgba,
+        }
+        numbers = {key: " ".join(f"{v:.9g}" for v in value) for key, value in fields.items()}
+        ET.SubElement(body, "geom", {"name": obstacle.name, "type": obstacle.kind, **numbers})
+    ET.indent(root)
+    path.write_text(ET.tostring(root, encoding="unicode") + "\n")
 
 
 def to_slots(obstacles: Sequence[Obstacle], num_slots: int) -> Obstacles:

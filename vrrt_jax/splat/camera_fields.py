@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from vrrt_jax.core.fields import check_fields
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.splat.camera import camera_from_matrix, look_at
@@ -86,3 +88,13 @@ def camera_from_dict(fields: Mapping[str, Any], size: tuple[int, ...]) -> Camera
         height=height,
         width=width,
     )
+
+
+def camera_to_dict(camera: Camera) -> dict[str, Any]:
+    """A camera as JSON, for :func:`camera_from_dict`."""
+    focal = float(camera.focal)
+    return {
+        "world_to_cam": np.asarray(camera.world_to_cam, float).tolist(),
+        "focal": [focal * camera.aspect, focal],
+        "centre": np.asarray(camera.principal_point, float).tolist(),
+    }

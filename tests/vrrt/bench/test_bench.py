@@ -23,7 +23,7 @@ from vrrt_jax.bench import (
 )
 from vrrt_jax.cli import main
 from vrrt_jax.core.edges import joint_error
-from vrrt_jax.scene.obstacles import load_obstacles
+from vrrt_jax.scene.obstacles import load_obstacles, write_obstacles
 from vrrt_jax.scene.verify import contacts
 from vrrt_jax.scene.world import obstacle_list
 
@@ -52,7 +52,7 @@ def test_packaged_worlds_hold_what_they_should(robot):
 
 def test_random_worlds_repeat_and_survive_their_file(panda, tmp_path):
     obstacles = worlds.random_world(panda, 1)
-    worlds.write_world(obstacles, tmp_path / "w.xml", "a comment")
+    write_obstacles(obstacles, tmp_path / "w.xml", "a comment")
     for written, read in zip(obstacles, load_obstacles(tmp_path / "w.xml"), strict=True):
         assert (written.name, written.kind) == (read.name, read.kind)
         np.testing.assert_allclose(written.position, read.position, atol=1e-6)

@@ -1,0 +1,55 @@
+"""The nodes of a search tree on the host, and as a small file."""
+
+import dataclasses
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from vrrt_jax.core.files import replacing
+from vrrt_jax.core.types import Tree
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Nodes:
+    """What a tree grew, without its empty slots. Letters: ``N`` nodes, ``D`` joints."""
+
+    q: np.ndarray  # (N, D) [rad] or [m]
+    parent: np.ndarray  # (N,) int, index of the parent, -1 for a root
+    score: np.ndarray  # (N,) lower is better
+
+    def edges(self, most: int) -> np.ndarray:
+        """Children (E,) int of all edges, or of evenly spaced ones if there are more than most."""
+        child = np.flatnonzero(self.parent >= 0)
+        return child[:: max(1, -(-len(child) // most))]
+
+
+def nodes_of(tree: Tree) -> Nodes:
+    """The nodes of a tree, on the host."""
+    size = int(tree.size)
+    return Nodes(**{name: np.asarray(getattr(tree, name))[:size] for name in _FIELDS})
+
+
+def save_nodes(nodes: Nodes, path: Path) -> None:
+    """Write a compressed ``.npz`` with the fields of :class:`Nodes`, at once or not at all."""
+    with replacing(path) as file:
+        np.savez_compressed(file, **{name: getattr(nodes, name) for name in _FIELDS})
+
+
+def load_nodes(path: Path) -> Nodes:
+    """Read what :func:`save_nodes` wrote.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: the file is damaged, or holds something else.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"no tree at '{path}'; plan again to write one")
+    try:
+        with np.load(path) as file:
+            return Nodes(**{name: file[name] for name in _FIELDS})
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"'{path}' is no readable tree ({error}); plan again") from None
+
+
+_FIELDS = tuple(field.name for field in dataclasses.fields(Nodes))

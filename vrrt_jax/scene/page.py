@@ -1,0 +1,230 @@
+"""A scene in the browser: bodies that move along a path, lines, pictures and numbers.
+
+The page is served by viser, to this machine alone.
+"""
+
+import contextlib
+import html
+import socket
+import threading
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from vrrt_jax.scene.body_meshes import body_mesh
+
+HOST = "127.0.0.1"
+FRAMES_PER_S = 30
+# Colors of a value from the lowest, which is the best, to the highest.
+_SCALE = np.array([[253, 231, 37], [94, 201, 98], [33, 145, 140], [59, 82, 139], [68, 1, 84]])
+_TABLE_STYLE = "font-size:0.8em;line-height:1.35;padding:0 0.8em;overflow-wrap:anywhere"
+
+
+class Page:
+    """A page in the browser at :attr:`url`; in a notebook it shows itself.
+
+    Args:
+        title: of the page.
+        port: of 127.0.0.1; a free one if None.
+
+    Raises:
+        ModuleNotFoundError: viser is not installed.
+        OSError: the port is taken.
+    """
+
+    def __init__(self, title: str, port: int | None = None):
+        """Start to serve an empty page."""
+        try:
+            import viser
+        except ModuleNotFoundError:
+            raise ModuleNotFoundError(
+                "the page needs viser, which is missing; pip install 'vrrt-jax[view]'"
+            ) from None
+        self._server = viser.ViserServer(HOST, _checked_port(port), label=title, verbose=False)
+        self._server.scene.set_up_direction("+z")
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._closed, self._playing = threading.Event(), threading.Event()
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return f"http://{HOST}:{self._server.get_port()}"
+
+    @property
+    def scene(self) -> Any:
+        """The scene of viser, to add things to."""
+        return self._server.scene
+
+    def look_from(self, eye: np.ndarray, target: np.ndarray, fovy: float = 0.8) -> None:
+        """Look from a place (3,) to another [m] at first, with a vertical field of view [rad]."""
+        camera = self._server.initial_camera
+        camera.up, camera.fov = (0.0, 0.0, 1.0), fovy
+        camera.position, camera.look_at = tuple(map(float, eye)), tuple(map(float, target))
+
+    def add_motion(
+        self, model: mujoco.MjModel, trajectory: np.ndarray, groups: Collection[int]
+    ) -> None:
+        """Add a robot with what stands around it, and a slider and a button that move it.
+
+        Args:
+            model: a compiled model; what is fixed to its world stands still.
+            trajectory: (T, D) configurations, a picture each [rad] or [m].
+            groups: of the geoms that are drawn.
+        """
+        position, quaternion = _body_poses(model, trajectory)
+        frames = []
+        for body in range(model.nbody):
+            mesh = body_mesh(model, body, groups)
+            if mesh is None:
+                continue
+            handle = self.scene.add_mesh_trimesh(f"/bodies/{body}", mesh)
+            handle.position, handle.wxyz = position[0, body], quaternion[0, body]
+            if body:
+                frames.append((body, handle))
+
+        def show(step: int) -> None:
+            with self._server.atomic():
+                for body, handle in frames:
+                    handle.position, handle.wxyz = position[step, body], quaternion[step, body]
+
+        self._add_player(len(trajectory), show)
+
+    def _add_player(self, num: int, show: Callable[[int], None]) -> None:
+        """A slider over ``num`` pictures, and a button that plays them."""
+        gui, last = self._server.gui, num - 1
+        slider = gui.add_slider("along the path", 0, max(last, 1), 1, 0, disabled=not last)
+        button = gui.add_button("play", disabled=not last)
+        slider.on_update(lambda _: show(min(int(slider.value), last)))
+
+        @button.on_click
+        def _(_: Any) -> None:
+            if self._playing.is_set():
+                self._playing.clear()
+                return
+            if slider.value >= last:
+                slider.value = 0
+            self._playing.set()
+
+        def play() -> None:
+            while not self._closed.wait(1 / FRAMES_PER_S):
+                if not self._playing.is_set():
+                    continue
+                slider.value = min(int(slider.value) + 1, last)
+                if slider.value >= last:
+                    self._playing.clear()
+
+        threading.Thread(target=play, daemon=True).start()
+
+    def add_mesh(
+        self, name: str, vertices: np.ndarray, faces: np.ndarray, color: tuple[int, int, int]
+    ) -> None:
+        """Add something that stands still: vertices (n, 3) [m], faces (m, 3) int."""
+        self.scene.add_mesh_simple(
+            f"/{name}", vertices, faces, color=color, flat_shading=True, side="double"
+        )
+
+    def add_lines(self, name: str, lines: np.ndarray, colors: np.ndarray, width: float) -> None:
+        """Add lines as one object, with a box to tick that hides it.
+
+        Args:
+            name: what they are.
+            lines: (E, P, 3) points of each line in the world [m].
+            colors: (3,) or (E, 3) uint8.
+            width: on the screen [px].
+        """
+        pieces = np.stack([lines[:, :-1], lines[:, 1:]], axis=2)  # (E, P - 1, 2, 3)
+        if not pieces.size:
+            return
+        each = np.broadcast_to(np.asarray(colors, np.uint8).reshape(-1, 1, 1, 3), pieces.shape)
+        handle = self.scene.add_line_segments(
+            f"/{name}",
+            pieces.reshape(-1, 2, 3).astype(np.float32),
+            each.reshape(-1, 2, 3),
+            thickness=width,
+            thickness_units="screen",
+        )
+        box = self._server.gui.add_checkbox(name, True)
+        box.on_update(lambda _: setattr(handle, "visible", box.value))
+
+    def add_picture(self, label: str, picture: np.ndarray) -> None:
+        """Add a picture (H, W, 3) uint8 below what is there."""
+        self._server.gui.add_image(picture, label=label)
+
+    def add_numbers(self, numbers: Mapping[str, Any]) -> None:
+        """Add a table of names and values below what is there."""
+        rows = "".join(
+            f"<tr><td>{html.escape(name)}</td><td><b>{html.escape(_words(value))}</b></td></tr>"
+            for name, value in numbers.items()
+        )
+        self._server.gui.add_html(f'<div style="{_TABLE_STYLE}"><table>{rows}</table></div>')
+
+    def serve(self) -> None:
+        """Wait until Ctrl-C, then end the page."""
+        with contextlib.suppress(KeyboardInterrupt):
+            self._closed.wait()
+        self.close()
+
+    def close(self) -> None:
+        """End the page."""
+        if not self._closed.is_set():
+            self._closed.set()
+            self._server.stop()
+
+    def _repr_html_(self) -> str:
+        """The page inside a notebook that runs on this machine."""
+        return f'<iframe src="{self.url}" width="100%" height="600" frameborder="0"></iframe>'
+
+
+def colors_of(values: np.ndarray) -> np.ndarray:
+    """Colors (n, 3) uint8 of values (n,), from bright for the lowest to dark for the highest.
+
+    Values that are not finite are dark.
+    """
+    finite = np.isfinite(values)
+    low, high = (values[finite].min(), values[finite].max()) if finite.any() else (0.0, 1.0)
+    share = np.where(finite, (values - low) / max(high - low, 1e-12), 1.0)
+    places = np.linspace(0, 1, len(_SCALE))
+    channels = [np.interp(share, places, channel) for channel in _SCALE.T]
+    return np.stack(channels, axis=1).astype(np.uint8)
+
+
+def _checked_port(port: int | None) -> int:
+    """The port, or a free one; viser would silently take another one than it is told.
+
+    Raises:
+        OSError: it is taken.
+    """
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port or 0))
+        except OSError as error:
+            raise OSError(
+                f"cannot serve at {HOST}:{port}: {error.strerror}; give another --port, or none "
+                "for one that is free"
+            ) from None
+        return probe.getsockname()[1]
+
+
+def _body_poses(model: mujoco.MjModel, trajectory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (T, nbody, 3) [m] and quaternions (T, nbody, 4) of all bodies along a path."""
+    data, poses = mujoco.MjData(model), []
+    for q in trajectory:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        poses.append((data.xpos.copy(), data.xquat.copy()))
+    position, quaternion = zip(*poses, strict=True)
+    return np.stack(position), np.stack(quaternion)
+
+
+def _words(value: Any) -> str:
+    """A value as people read it."""
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "-"}[value]
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_words(each)}" for name, each in value.items())
+    return str(value)

@@ -1,0 +1,178 @@
+"""A plan in the browser: the robot along its path, the tree it grew, the goal beside the end."""
+
+import dataclasses
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from vrrt_jax.core.edges import difference
+from vrrt_jax.core.precision import single_precision
+from vrrt_jax.core.result import PlanResult
+from vrrt_jax.core.tree_file import Nodes, load_nodes, nodes_of
+from vrrt_jax.problems import load_problem, read_json
+from vrrt_jax.report import outcome
+from vrrt_jax.robots import Robot
+from vrrt_jax.robots.kinematics import batch_link_poses
+from vrrt_jax.robots.mesh_sources import mesh_spec
+from vrrt_jax.scene.page import Page, colors_of
+from vrrt_jax.scene.world import World, obstacle_list
+from vrrt_jax.splat.camera import shrunk, squared
+from vrrt_jax.splat.mujoco_images import OBSTACLE_GROUP, VISUAL_GROUPS, MeshRenderer
+from vrrt_jax.visual.goal import ImageGoal
+from vrrt_jax.viz import ScenePainter, along, over_sky
+
+PICTURES = 151  # along a path: five seconds of play
+PICTURE_PX = 240  # height of the goal image and of the end beside it
+MOST_EDGES = 50_000  # drawn of a tree
+EDGE_POINTS = 5  # along an edge, which is a curve in space
+_SURFACE_GROUP = 4  # of the spheres that follow the surface, in ``Robot.xml``
+_WAY, _PATH = (255, 150, 40), (214, 40, 57)
+# What the page tells of a result, in this order.
+_TOLD = (
+    *("status", "advice", "verified", "verified_with", "contact", "loss", "goal_loss"),
+    *("match_probability", "cost", "raw_cost", "clearance_m", "tree_share", "error_rad"),
+    *("timing", "counts", "seed"),
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Plan:
+    """What is shown of a plan."""
+
+    path: np.ndarray  # (P, D)
+    raw_path: np.ndarray  # (P', D) as the tree has it
+    nodes: Nodes
+    numbers: Mapping[str, Any]
+
+
+@single_precision
+def view(result: PlanResult, world: World, goal: Any = None, *, port: int | None = None) -> Page:
+    """Show a plan on a page in the browser, which only this machine can reach.
+
+    The last expression of a notebook's cell shows itself. A script calls ``view(...).serve()``,
+    which waits until Ctrl-C.
+
+    Args:
+        result: from :func:`vrrt_jax.plan` or :func:`vrrt_jax.plan_to_configuration`.
+        world: that it was planned in.
+        goal: that it was planned to; of an :class:`ImageGoal` the first image is shown beside the
+            end of the path.
+        port: of 127.0.0.1; a free one if None.
+
+    Raises:
+        ModuleNotFoundError: viser is not installed.
+        OSError: the port is taken.
+    """
+    plan = _Plan(
+        path=result.path,
+        raw_path=result.raw_path,
+        nodes=nodes_of(result.tree),
+        numbers=outcome(world, result),
+    )
+    return _page(plan, world, goal, port)
+
+
+@single_precision
+def view_folder(folder: Path, *, port: int | None = None) -> Page:
+    """Show what ``vrrt plan --out FOLDER`` wrote, see :func:`view`.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a file is damaged.
+    """
+    if not (folder / "result.json").is_file():
+        raise FileNotFoundError(
+            f"no plan at '{folder}': it has no result.json; write one with: vrrt plan --out FOLDER"
+        )
+    # Nothing is planned here: the engine that loads fastest does.
+    problem = load_problem(folder / "problem", engine="closed_form")
+    try:
+        with np.load(folder / "path.npz") as file:
+            path, raw_path = file["path"], file["raw_path"]
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"'{folder / 'path.npz'}' is no path ({error}); plan again") from None
+    plan = _Plan(
+        path=path,
+        raw_path=raw_path,
+        nodes=load_nodes(folder / "tree.npz"),
+        numbers=read_json(folder / "result.json"),
+    )
+    return _page(plan, problem.world, problem.goal, port)
+
+
+def _page(plan: _Plan, world: World, goal: Any, port: int | None) -> Page:
+    robot: Robot = world.robot.value
+    page = Page(f"{robot.name}: {plan.numbers['status']}", port)
+    try:
+        model, groups = _model(robot, world)
+        trajectory = along(world, plan.path, PICTURES)
+        page.add_motion(model, trajectory, groups)
+        _add_lines(page, plan, world, trajectory)
+        if isinstance(goal, ImageGoal):
+            _add_pictures(page, goal, world, plan.path[-1])
+        else:
+            tip = _tips(robot, plan.path[-1:])[0]
+            page.look_from(tip + np.array([1.2, 1.2, 0.8]), tip)
+        page.add_numbers({name: plan.numbers[name] for name in _TOLD if name in plan.numbers})
+    except BaseException:
+        page.close()
+        raise
+    return page
+
+
+def _model(robot: Robot, world: World) -> tuple[mujoco.MjModel, tuple[int, ...]]:
+    """Robot, obstacles and held objects, and the groups to draw: true meshes, or spheres."""
+    spec, groups = mesh_spec(robot), VISUAL_GROUPS
+    if spec is None:
+        spec, groups = mujoco.MjSpec.from_string(robot.xml), (_SURFACE_GROUP,)
+    model = MeshRenderer(spec, obstacle_list(world), world.attached).model
+    return model, (*groups, OBSTACLE_GROUP)
+
+
+def _add_lines(page: Page, plan: _Plan, world: World, trajectory: np.ndarray) -> None:
+    """The tree by loss, its way to the goal, and the path, as places of the hand."""
+    robot, nodes = world.robot.value, plan.nodes
+    child = nodes.edges(MOST_EDGES)
+    # Bright is a low loss, on a scale of powers of ten, as in the figures.
+    colors = colors_of(np.log10(nodes.score[child] + 1e-9))
+    start, end = nodes.q[nodes.parent[child]], nodes.q[child]
+    page.add_lines("tree (bright: low loss)", _curves(world, start, end), colors, 1.0)
+    raw = plan.raw_path
+    page.add_lines("way in the tree", _curves(world, raw[:-1], raw[1:]), np.array(_WAY), 3.0)
+    page.add_lines("path", _tips(robot, trajectory)[None], np.array(_PATH), 5.0)
+
+
+def _curves(world: World, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Places (E, EDGE_POINTS, 3) of the hand along edges between configurations (E, D)."""
+    step = np.asarray(difference(world, jnp.asarray(start), jnp.asarray(end)))
+    q = start[:, None] + np.linspace(0, 1, EDGE_POINTS)[:, None] * step[:, None]
+    return _tips(world.robot.value, q.reshape(-1, q.shape[-1])).reshape(*q.shape[:2], 3)
+
+
+def _tips(robot: Robot, q: np.ndarray) -> np.ndarray:
+    """The middle (n, 3) of the last link's spheres [m], at configurations (n, D)."""
+    spheres = robot.self_collision_spheres
+    centers = np.asarray(spheres.center)[np.asarray(spheres.link) == robot.chain.num_links - 1]
+    tip = centers.mean(axis=0) if len(centers) else np.zeros(3)
+    pose = np.asarray(batch_link_poses(robot.chain, jnp.asarray(q, jnp.float32)))[:, -1]
+    return pose[:, :3, :3] @ tip + pose[:, :3, 3]
+
+
+def _add_pictures(page: Page, goal: ImageGoal, world: World, q_end: np.ndarray) -> None:
+    """The first goal image and the end of the path, as its camera sees it, which looks first."""
+    cameras, images, _ = goal.views
+    camera = squared(cameras[0])
+    camera = shrunk(camera, max(1, round(camera.height / PICTURE_PX)))
+    painter = ScenePainter(world.robot.value, world, goal.self_model, camera)
+    end, wanted = painter.paint(q_end), over_sky(images[0], (camera.width, camera.height))
+    page.add_picture("goal image | end of the path", np.concatenate([wanted, end], axis=1))
+    # Look from the camera, at what lies as deep as the hand.
+    pose = np.linalg.inv(np.asarray(camera.world_to_cam, float))
+    tip, fovy = _tips(world.robot.value, q_end[None])[0], camera.height / float(camera.focal)
+    depth = max((tip - pose[:3, 3]) @ pose[:3, 2], 0.1)
+    page.look_from(pose[:3, 3], pose[:3, 3] + depth * pose[:3, 2], 2 * np.arctan(fovy / 2))
