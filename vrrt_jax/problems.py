@@ -80,7 +80,7 @@ def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
         true_goal = fields.get("true_goal")
         views = _checked_views(fields["views"], file)
         images = tuple(
-            read_image(folder / _beside(folder, view["image"], "image")) for view in views
+            read_image(_beside(folder, view["image"], "image")) for view in views
         )
         cameras = tuple(
             camera_from_dict(view["camera"], image.shape[:2])

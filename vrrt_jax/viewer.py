@@ -118,7 +118,8 @@ def _page(plan: _Plan, world: World, goal: Any, port: int | None) -> Page:
         else:
             tip = _tips(robot, plan.path[-1:])[0]
             page.look_from(tip + np.array([1.2, 1.2, 0.8]), tip)
-        page.add_numbers({name: plan.numbers[name] for name in _TOLD if name in plan.numbers})
+        told = {name: plan.numbers[name] for name in _TOLD if plan.numbers.get(name) is not None}
+        page.add_numbers({name: value for name, value in told.items() if value != ""})
     except BaseException:
         page.close()
         raise
@@ -138,10 +139,10 @@ def _add_lines(page: Page, plan: _Plan, world: World, trajectory: np.ndarray) ->
     """The tree by loss, its way to the goal, and the path, as places of the hand."""
     robot, nodes = world.robot.value, plan.nodes
     child = nodes.edges(MOST_EDGES)
-    # Bright is a low loss, on a scale of powers of ten, as in the figures.
+    # On a scale of powers of ten, as in the figures.
     colors = colors_of(np.log10(nodes.score[child] + 1e-9))
     start, end = nodes.q[nodes.parent[child]], nodes.q[child]
-    page.add_lines("tree (bright: low loss)", _curves(world, start, end), colors, 1.0)
+    page.add_lines("tree (strong: low loss)", _curves(world, start, end), colors, 1.0)
     raw = plan.raw_path
     page.add_lines("way in the tree", _curves(world, raw[:-1], raw[1:]), np.array(_WAY), 3.0)
     page.add_lines("path", _tips(robot, trajectory)[None], np.array(_PATH), 5.0)

@@ -17,8 +17,8 @@ from vrrt_jax.scene.body_meshes import body_mesh
 
 HOST = "127.0.0.1"
 FRAMES_PER_S = 30
-# Colors of a value from the lowest, which is the best, to the highest.
-_SCALE = np.array([[253, 231, 37], [94, 201, 98], [33, 145, 140], [59, 82, 139], [68, 1, 84]])
+# Colors of a value from the lowest, which is the best, to the highest, which hides nothing.
+_SCALE = np.array([[0, 110, 60], [0, 130, 160], [150, 185, 220], [225, 228, 238]])
 _TABLE_STYLE = "font-size:0.8em;line-height:1.35;padding:0 0.8em;overflow-wrap:anywhere"
 
 
@@ -155,7 +155,8 @@ class Page:
     def add_numbers(self, numbers: Mapping[str, Any]) -> None:
         """Add a table of names and values below what is there."""
         rows = "".join(
-            f"<tr><td>{html.escape(name)}</td><td><b>{html.escape(_words(value))}</b></td></tr>"
+            f'<tr><td style="white-space:nowrap">{html.escape(name)}</td>'
+            f"<td><b>{html.escape(_words(value))}</b></td></tr>"
             for name, value in numbers.items()
         )
         self._server.gui.add_html(f'<div style="{_TABLE_STYLE}"><table>{rows}</table></div>')
@@ -178,9 +179,9 @@ class Page:
 
 
 def colors_of(values: np.ndarray) -> np.ndarray:
-    """Colors (n, 3) uint8 of values (n,), from bright for the lowest to dark for the highest.
+    """Colors (n, 3) uint8 of values (n,), from strong for the lowest to pale for the highest.
 
-    Values that are not finite are dark.
+    Values that are not finite are pale.
     """
     finite = np.isfinite(values)
     low, high = (values[finite].min(), values[finite].max()) if finite.any() else (0.0, 1.0)
