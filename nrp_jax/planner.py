@@ -109,7 +109,7 @@ def plan(
     tree = policy.init(world, goal, np.asarray(start)[None], config.capacity)
     scene = scene or ExactScene(robot, grid)
     if starts_at(goal, world, start):
-        found = no_search(policy, tree)
+        found = no_search(policy, goal, tree)
         at_goal = np.asarray(start)[None]
         return _moved(_finish(scene, world, places, goal, at_goal, found, key), places)
     tried, spent, rejected = 0, Counter(), Counter()

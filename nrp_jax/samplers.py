@@ -73,6 +73,12 @@ class DiscriminatorSampler:
         self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
     ) -> jax.Array:
         """See :class:`Sampler`."""
+        return self.propose_and_count(world, q_from, q_goal, key)[0]
+
+    def propose_and_count(
+        self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Waypoints as :meth:`propose` makes them, and how many configurations it checked."""
         inputs = network_inputs(self.config, self.robot, world, q_from, q_goal)
         q, points = self._candidates(world, q_from, q_goal, key)
         # Candidates are drawn around the start. A window is centered there; a whole map is not.
@@ -158,6 +164,12 @@ class CVAESampler:
         self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
     ) -> jax.Array:
         """See :class:`Sampler`."""
+        return self.propose_and_count(world, q_from, q_goal, key)[0]
+
+    def propose_and_count(
+        self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Waypoints as :meth:`propose` makes them, and how many configurations it checked."""
         inputs = network_inputs(self.config, self.robot, world, q_from, q_goal)
         z = jax.random.normal(key, (len(q_from), self.num_edge_checked, self.config.latent))
         module: Any = build_module(self.config, self.num_outputs)
@@ -167,6 +179,18 @@ class CVAESampler:
         q = features.to_configuration(self.config, self.robot, made)
         q = enforce_bounds(world, features.to_world(q, inputs.center[:, None]))
         return first_free(world, q_from, q, self.edge_checks)
+
+
+def proposed(
+    sampler: Any, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
+) -> tuple[jax.Array, Any]:
+    """Waypoints (B, D) of a sampler, and how many configurations it checked for collision, ().
+
+    A sampler without ``propose_and_count`` counts as one that checks nothing.
+    """
+    if hasattr(sampler, "propose_and_count"):
+        return sampler.propose_and_count(world, q_from, q_goal, key)
+    return sampler.propose(world, q_from, q_goal, key), 0
 
 
 def _postures(

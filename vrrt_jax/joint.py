@@ -88,7 +88,7 @@ def _attempt(
     if starts_at(goal, world, q_start):
         tree = policy.init(world, goal, q_start[None], config.tree.capacity)
         chosen = _chosen(world, goal, q_start[None], q_start)
-        result = finish(robot, world, no_search(policy, tree), chosen, q_start, key, config)
+        result = finish(robot, world, no_search(policy, goal, tree), chosen, q_start, key, config)
         return dataclasses.replace(result, advice=JOINT_ADVICE[result.status])
     wary = keeping_clearance(world, np.stack([q_start, goal.q]), config.path.margin)
     limit = config.budget.max_iterations

@@ -141,34 +141,41 @@ def _points_free(world: GridWorld, q_from, edge, index: jax.Array, fraction: jax
     return jax.vmap(world.is_free)(jax.lax.optimization_barrier(q))
 
 
-def first_free(world: GridWorld, q_from: jax.Array, q: jax.Array, num_checks: int) -> jax.Array:
-    """The first waypoint (B, D) of each lane whose edge is free; the best if none is.
+def first_free(
+    world: GridWorld, q_from: jax.Array, q: jax.Array, num_checks: int
+) -> tuple[jax.Array, jax.Array]:
+    """The first waypoint of each lane whose edge is free; the best if none is.
 
     Args:
         world: the robot in a home.
         q_from: (B, D) starts of the edges.
         q: (B, K, D) waypoints, the best first.
         num_checks: configurations checked along each edge, the last of them the waypoint.
+
+    Returns:
+        (B, D) waypoints, and () i32 how many configurations were checked.
     """
     lanes, many, joints = q.shape
     if many == 1:
-        return q[:, 0]
+        return q[:, 0], jnp.int32(0)
     # A round checks B edges, of the lanes that have found no free one. Most lanes are done after
     # the first round, so that the others get several edges of the next. ``turn`` orders the edges:
     # the best of all lanes, then the second best, and so on.
     turn = jnp.arange(many)[None] * lanes + jnp.arange(lanes)[:, None]
 
     def check_round(state):
-        pending, free = state  # (B, K) edges still to check, and those found free
+        pending, free, checked = state  # (B, K) edges still to check, and those found free
         _, index = jax.lax.top_k(-jnp.where(pending, turn, many * lanes).reshape(-1), lanes)
         lane = index // many
         edge = world.edge(q_from[lane], q.reshape(-1, joints)[index])
-        whole = free_prefix(world, q_from[lane], edge, num_checks) == num_checks
-        free = free.at[lane, index % many].max(whole)
+        num_free, more = free_prefix(world, q_from[lane], edge, num_checks)
+        free = free.at[lane, index % many].max(num_free == num_checks)
         pending = pending.at[lane, index % many].set(False)
         # A lane with a free edge has no more edges to check.
-        return pending & ~jnp.any(free, axis=1, keepdims=True), free
+        return pending & ~jnp.any(free, axis=1, keepdims=True), free, checked + more
 
     untried = jnp.ones((lanes, many), bool)
-    _, free = jax.lax.while_loop(lambda s: jnp.any(s[0]), check_round, (untried, ~untried))
-    return jnp.take_along_axis(q, jnp.argmax(free, axis=1)[:, None, None], axis=1)[:, 0]
+    start = (untried, ~untried, jnp.int32(0))
+    _, free, checked = jax.lax.while_loop(lambda s: jnp.any(s[0]), check_round, start)
+    first = jnp.argmax(free, axis=1)[:, None, None]
+    return jnp.take_along_axis(q, first, axis=1)[:, 0], checked

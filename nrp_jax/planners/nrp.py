@@ -1,10 +1,12 @@
 """RRT with learned waypoints: Neural Randomized Planning (Lu, Ma, Hsu and Cai) on the kernel."""
 
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from nrp_jax.samplers import proposed
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import free_prefix
@@ -42,13 +44,14 @@ class NeuralRRT(RRT):
         parent, aim = self.sample_aims(world, goal, tree, key_aim)
         straight = jax.random.uniform(key_straight, (self.lanes,)) < self.straight_rate
         straight = straight.at[0].set(straight[0] | (tree.iteration == 0))
-        waypoint = self.sampler.propose(world, tree.q[parent], aim, key_sampler)
+        waypoint, checked = proposed(self.sampler, world, tree.q[parent], aim, key_sampler)
         return Proposals(
             parent=parent,
             target=jnp.where(straight[:, None], aim, waypoint),
             valid=jnp.ones(self.lanes, bool),
             partial=jnp.ones(self.lanes, bool),
             aux=WaypointLanes(aim=aim, straight=straight),
+            checked=checked,
         )
 
     def after_insert(
@@ -66,7 +69,8 @@ class NeuralRRT(RRT):
         # From every waypoint that was reached, as far towards the aim as the edge is free.
         onward = expansion.accepted & ~expansion.blocked & ~lanes.straight
         edge = world.steer(expansion.q, lanes.aim, self.edge_steps)
-        num_free = free_prefix(world, expansion.q, edge, self.edge_steps)
+        num_free, checked = free_prefix(world, expansion.q, edge, self.edge_steps)
+        tree = dataclasses.replace(tree, checked=tree.checked + checked)
         edge = world.truncate(edge, num_free / self.edge_steps)
         q, length = world.normalize(world.end(expansion.q, edge)), world.length(edge)
 

@@ -17,7 +17,7 @@ from nrp_jax.planner import Status, plan
 from nrp_jax.scene.exact import ExactScene, Verification, verify
 from nrp_jax.scene.trajectory import trajectory_of
 from vrrt_jax.core.planners import RRTStar
-from vrrt_jax.core.shortcut import shortcut
+from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import pytree
 
 START = np.array([1.0, 1.0, 0.6, 1.0, -0.8, 1.0, -0.8, 0.9], np.float32)
@@ -44,9 +44,12 @@ def scene(snake, home):
 
 
 @pytest.fixture(scope="module")
-def solve(snake, home, scene):
-    world = nrp_jax.build_world(snake, home)
+def home_world(snake, home):
+    return nrp_jax.build_world(snake, home)
 
+
+@pytest.fixture(scope="module")
+def solve(snake, home, scene, home_world):
     def run(method, seed=0, **options):
         return plan(
             snake,
@@ -55,7 +58,7 @@ def solve(snake, home, scene):
             GOAL,
             key=jax.random.key(seed),
             method=method,
-            world=world,
+            world=home_world,
             scene=scene,
             **{"capacity": 2048, **options},
         )
@@ -82,13 +85,25 @@ def check(result, start=START, goal=GOAL):
     assert result.raw_path.shape[1] == len(start)
 
 
+def check_history(result, world):
+    """Costs only fall, counts only rise, and the last cost is the length of the path."""
+    iteration, seconds, _, nodes, cost, checked = result.history.T
+    assert np.isinf(cost[0]) and np.all(cost[1:] <= cost[:-1])
+    for column in (iteration, seconds, nodes, checked):
+        assert np.all(np.diff(column) >= 0)
+    assert checked[0] == 0 and checked[-1] >= iteration[-1]
+    assert nodes[-1] == int(result.tree.size)
+    np.testing.assert_allclose(cost[-1], path_length(world, result.raw_path), rtol=1e-4)
+
+
 @pytest.mark.parametrize("method", ["rrt", "rrt-is", "rrt-connect"])
-def test_finds_the_door(solve, method):
+def test_finds_the_door(solve, home_world, method):
     result = solve(method)
     check(result)
     in_door = np.abs(result.trajectory[:, 0] - 2.5) < 0.1
     assert np.all((result.trajectory[in_door, 1] > 2.5) & (result.trajectory[in_door, 1] < 3.5))
     assert 4.0 < result.cost < 12.0
+    check_history(result, home_world)
 
 
 def test_the_tree_of_rrt_is_holds(solve, snake, home):

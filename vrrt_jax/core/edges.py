@@ -249,7 +249,9 @@ def num_checks(world: Space, max_step: float) -> int:
     return max(1, math.ceil(max_step / float(world.resolution) - 1e-3))
 
 
-def free_prefix(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) -> jax.Array:
+def free_prefix(
+    world: Space, q_from: jax.Array, edge: Edge, num_steps: int
+) -> tuple[jax.Array, jax.Array]:
     """How far one can go along edges before something is touched.
 
     Args:
@@ -259,20 +261,23 @@ def free_prefix(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) -> 
         num_steps: S sub-steps along each edge, checked at their far ends.
 
     Returns:
-        (B,) i32 number of leading sub-steps that are free; S where the whole edge is.
+        (B,) i32 number of leading sub-steps that are free, S where the whole edge is; and () i32
+        how many configurations were checked for that.
     """
     checks = _check(world, q_from, edge, num_steps, lambda checks, step: step < checks.first)
-    return checks.first[:, 0]
+    return checks.first[:, 0], checks.checked
 
 
-def is_edge_free(world: Space, q_from: jax.Array, edge: Edge, num_steps: int) -> jax.Array:
-    """Whether (B,) nothing is touched along whole edges; see :func:`free_prefix`.
+def is_edge_free(
+    world: Space, q_from: jax.Array, edge: Edge, num_steps: int
+) -> tuple[jax.Array, jax.Array]:
+    """Whether (B,) nothing is touched along whole edges, and () i32 how many checks that took.
 
-    An edge costs nothing more once something is found on it.
+    An edge costs nothing more once something is found on it. See :func:`free_prefix`.
     """
     whole = num_steps
     checks = _check(world, q_from, edge, whole, lambda checks, step: checks.first == whole)
-    return checks.first[:, 0] == whole
+    return checks.first[:, 0] == whole, checks.checked
 
 
 def first_free_edge(
@@ -309,6 +314,7 @@ def first_free_edge(
 class _Checks:
     known: jax.Array  # (B, S) bool, checked or known to be free
     first: jax.Array  # (B, 1) i32 the first sub-step known to be blocked, S if none is
+    checked: jax.Array  # () i32 configurations checked
 
 
 def _check(
@@ -364,11 +370,13 @@ def _check(
         change = change.at[lane, jnp.maximum(at - reach, 0)].add(1, mode="drop")
         change = change.at[lane, jnp.minimum(at + reach, num_steps - 1) + 1].add(-1, mode="drop")
         covered = jnp.cumsum(change, axis=1)[:, :num_steps] > 0
-        return _Checks(known=checks.known | covered, first=first)
+        checked = checks.checked + jnp.sum(valid, dtype=jnp.int32)
+        return _Checks(known=checks.known | covered, first=first, checked=checked)
 
     start = _Checks(
         known=jnp.broadcast_to(ends_known & (step == num_steps - 1), (lanes, num_steps)),
         first=jnp.full((lanes, 1), num_steps, jnp.int32),
+        checked=jnp.int32(0),
     )
     return jax.lax.while_loop(lambda checks: jnp.any(open_checks(checks)), check, start)
 

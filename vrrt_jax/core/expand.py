@@ -35,7 +35,7 @@ def expand(
     edge = world.steer(q_from, proposals.target, policy.edge_steps)
 
     # Check edges: how many leading sub-steps are free. A blocked edge is cut there, or given up.
-    num_free = free_prefix(world, q_from, edge, policy.edge_steps)
+    num_free, checked = free_prefix(world, q_from, edge, policy.edge_steps)
     free = (num_free == policy.edge_steps) | (proposals.partial & (num_free > 0))
     edge = world.truncate(edge, num_free / policy.edge_steps)
     length = world.length(edge)
@@ -71,7 +71,10 @@ def expand(
         ~accepted,
     )
     tree = dataclasses.replace(
-        tree, iteration=tree_before.iteration + 1, rejected=tree_before.rejected + rejected
+        tree,
+        iteration=tree_before.iteration + 1,
+        rejected=tree_before.rejected + rejected,
+        checked=tree_before.checked + proposals.checked + checked,
     )
 
     # Follow up: the policy's own book-keeping, with all children in the tree.

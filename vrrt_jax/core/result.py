@@ -70,8 +70,9 @@ class PlanResult:
     iterations: int
     expansions: int  # lanes tried
     timing: Mapping[str, float]  # compile_s, search_s, shortcut_s, verify_s
-    # (chunks + 1, 4): iteration, seconds, best score (of RRT-Connect: the distance between its
-    # trees), nodes
+    # (chunks + 1, 6): iteration, seconds, best score (of RRT-Connect: the distance between its
+    # trees), nodes, length of the best path (inf before the first; not shortened), and
+    # configurations checked for collision, those of samplers included
     history: np.ndarray
     tree: Tree
     # Smallest distance of the collision spheres to obstacles on the path [m], where it is measured.

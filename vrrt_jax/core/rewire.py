@@ -57,7 +57,8 @@ def rewire(
     cost_through_old = jnp.where(near, tree.cost + distances, jnp.inf)
     best, cost_via = jnp.argmin(cost_through_old, axis=1), jnp.min(cost_through_old, axis=1)
     lane, better = _largest(tree.cost[new] - cost_via, checks)
-    better &= _edge_is_free(world, tree.q[best[lane]], expansion.q[lane], edge_steps)
+    free, checked_parents = _edge_is_free(world, tree.q[best[lane]], expansion.q[lane], edge_steps)
+    better &= free
     slot = jnp.where(better, expansion.node_index[lane], tree.capacity)
     parent = tree.parent.at[slot].set(best[lane].astype(jnp.int32), mode="drop")
     cost = tree.cost.at[slot].set(cost_via[lane], mode="drop")
@@ -74,13 +75,17 @@ def rewire(
         (most[None] == most[:, None]) & (jnp.arange(len(new)) < jnp.arange(len(new))[:, None])
     )
     lane, adopts = _largest(jnp.where(jnp.any(same_child & rival, axis=1), 0.0, most), checks)
-    adopts &= _edge_is_free(world, expansion.q[lane], tree.q[child[lane]], edge_steps)
+    free, checked_children = _edge_is_free(
+        world, expansion.q[lane], tree.q[child[lane]], edge_steps
+    )
+    adopts &= free
     parent = parent.at[jnp.where(adopts, child[lane], tree.capacity)].set(
         new[lane].astype(jnp.int32), mode="drop"
     )
 
     # An adopted node passes its gain on to its whole subtree.
-    tree = dataclasses.replace(tree, parent=parent, cost=cost)
+    checked = tree.checked + checked_parents + checked_children
+    tree = dataclasses.replace(tree, parent=parent, cost=cost, checked=checked)
     return jax.lax.cond(jnp.any(adopts), lambda t: with_costs(world, t), lambda t: t, tree)
 
 
@@ -101,6 +106,9 @@ def with_costs(world: Space, tree: Tree[Payload]) -> Tree[Payload]:
     return dataclasses.replace(tree, cost=tree.cost[ancestor] + length)
 
 
-def _edge_is_free(world: Space, q_from: jax.Array, q_to: jax.Array, steps: int) -> jax.Array:
+def _edge_is_free(
+    world: Space, q_from: jax.Array, q_to: jax.Array, steps: int
+) -> tuple[jax.Array, jax.Array]:
     edge = world.edge(q_from, q_to)
-    return world.is_resolved(edge, steps) & is_edge_free(world, q_from, edge, steps)
+    free, checked = is_edge_free(world, q_from, edge, steps)
+    return world.is_resolved(edge, steps) & free, checked

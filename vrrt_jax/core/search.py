@@ -15,7 +15,7 @@ from vrrt_jax.core.edges import Space
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.precision import single_precision
-from vrrt_jax.core.tree import with_capacity
+from vrrt_jax.core.tree import path_cost, with_capacity
 from vrrt_jax.core.types import ExpansionPolicy, Tree, pytree
 
 MAX_CAPACITY = 1 << 20  # nodes that a tree may grow to
@@ -62,7 +62,9 @@ class SearchResult:
 
     tree: Tree
     stopped: StopReason  # of a batch, the last of them in the order above
-    history: np.ndarray  # (chunks + 1, 4): iteration, seconds, best score, nodes
+    # (chunks + 1, 6): iteration, seconds, best score, nodes, length of the best path (inf before
+    # the first) and configurations checked for collision, those of samplers included
+    history: np.ndarray
     compile_s: float
     search_s: float
     lanes: int = 32  # expansions an iteration
@@ -188,13 +190,13 @@ def search(
     state = (_initials if batched else _initial)(tree)
     advance = partial(_chunks if batched else _chunk, world, goal, policy)
     compile_s = _compile(advance, state, termination, key)
-    history = [_record(state, 0.0)]
+    history = [_record(policy, goal, state, 0.0)]
     started = time.perf_counter()
     with interruptible() as interrupted:
         while True:
             state, codes = jax.block_until_ready(advance(state, termination, key, jnp.int32(CHUNK)))
             seconds = time.perf_counter() - started
-            history.append(_record(state, seconds))
+            history.append(_record(policy, goal, state, seconds))
             if on_progress is not None:
                 on_progress(state, seconds)
             codes = np.atleast_1d(codes)
@@ -224,13 +226,13 @@ def search(
     )
 
 
-def no_search(policy: ExpansionPolicy, tree: Tree) -> SearchResult:
+def no_search(policy: ExpansionPolicy, goal: Any, tree: Tree) -> SearchResult:
     """The search of a plan that has nothing to search for: it starts at its goal."""
     return SearchResult(
         tree=tree,
         stopped=StopReason.REACHED,
         stopped_each=(StopReason.REACHED,),
-        history=np.array([_record(_initial(tree), 0.0)]),
+        history=np.array([_record(policy, goal, _initial(tree), 0.0)]),
         compile_s=0.0,
         lanes=policy.lanes,
         search_s=0.0,
@@ -246,12 +248,25 @@ def _compile(
     return time.perf_counter() - started
 
 
-def _record(state: SearchState, seconds: float) -> tuple[float, float, float, float]:
+def _record(
+    policy: ExpansionPolicy, goal: Any, state: SearchState, seconds: float
+) -> tuple[float, ...]:
     """A row of the history; of a batch, the problem that is furthest from its goal."""
-    iteration, best, size = (float(number) for number in jax.device_get(_summary(state.tree)))
-    return iteration, seconds, best, size
+    iteration, *rest = (
+        float(number) for number in jax.device_get(_summary(policy, goal, state.tree))
+    )
+    return iteration, seconds, *rest
 
 
 @jax.jit
-def _summary(tree: Tree) -> tuple[jax.Array, jax.Array, jax.Array]:
-    return jnp.max(tree.iteration), jnp.max(jnp.min(tree.score, axis=-1)), jnp.max(tree.size)
+def _summary(policy: ExpansionPolicy, goal: Any, tree: Tree) -> tuple[jax.Array, ...]:
+    cost = getattr(policy, "path_cost", path_cost)
+    if tree.iteration.ndim:
+        cost = jax.vmap(cost)
+    return (
+        jnp.max(tree.iteration),
+        jnp.max(jnp.min(tree.score, axis=-1)),
+        jnp.max(tree.size),
+        jnp.max(cost(tree, goal.threshold)),
+        jnp.max(tree.checked),
+    )

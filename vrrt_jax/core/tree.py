@@ -49,6 +49,7 @@ def create(
         size=jnp.int32(roots),
         iteration=jnp.int32(0),
         rejected=jnp.zeros(len(Rejection), jnp.int32),
+        checked=jnp.int32(0),
         payload=jax.tree.map(lambda leaf: padded(leaf, 0), payload),
     )
 
@@ -185,9 +186,22 @@ def branch_path(tree: Tree, index: int) -> np.ndarray:
     return np.asarray(tree.q)[lineage(tree, index)]
 
 
-def best_path(tree: Tree) -> np.ndarray | None:
-    """The path (P, D) from the start, node 0, to the best node; None if no edges join them."""
-    best = int(np.argmin(tree.score))
+def best_node(tree: Tree, threshold: Array | float = 0.0) -> jax.Array:
+    """The cheapest node () i32 with a score of at most ``threshold``, or that of the best score."""
+    enough = jnp.maximum(jnp.min(tree.score), threshold)
+    return jnp.argmin(jnp.where(tree.score <= enough, tree.cost, jnp.inf)).astype(jnp.int32)
+
+
+def path_cost(tree: Tree, threshold: Array | float) -> jax.Array:
+    """Length () of the path to :func:`best_node`; inf if its score is higher or no path is."""
+    best = best_node(tree, threshold)
+    reached = (tree.score[best] <= threshold) & (tree.cost[best] < UNREACHED)
+    return jnp.where(reached, tree.cost[best], jnp.inf)
+
+
+def best_path(tree: Tree, threshold: float = 0.0) -> np.ndarray | None:
+    """The path (P, D) from the start, node 0, to :func:`best_node`; None if no edges join them."""
+    best = int(best_node(tree, threshold))
     return branch_path(tree, best) if lineage(tree, best)[0] == 0 else None
 
 

@@ -156,6 +156,7 @@ class Tree(Generic[Payload]):
     size: jax.Array  # () i32 number of nodes
     iteration: jax.Array  # () i32 iterations done
     rejected: jax.Array  # (len(Rejection),) i32 lanes lost, by reason
+    checked: jax.Array  # () i32 configurations checked for collision
     payload: Payload  # leaves (N, ...): what the policy keeps for each node
 
     @property
@@ -173,6 +174,7 @@ class Proposals:
     valid: jax.Array  # (B,) bool, False where the lane has nothing to try
     partial: jax.Array  # (B,) bool, keep the free part of a blocked edge
     aux: Any  # leaves (B, ...): handed to ``evaluate`` and ``after_insert``
+    checked: Any = 0  # () i32 configurations that proposing checked for collision
 
 
 @pytree
@@ -209,6 +211,10 @@ class ExpansionPolicy(Protocol[Payload]):
     other methods run on the host, before and after the search. To a goal that is no configuration,
     such as an image, the scores have to be losses: :func:`vrrt_jax.plan` then chooses where to end
     among all nodes, and does not ask ``extract_path``.
+
+    A policy may also say how long its best path is so far, for the history of a search:
+    ``path_cost(tree, threshold)`` is a length (), inf before the first path, where ``threshold`` ()
+    is the goal's. Without it that is :func:`vrrt_jax.core.tree.path_cost`.
     """
 
     @property

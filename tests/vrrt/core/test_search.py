@@ -100,3 +100,6 @@ def test_trees_of_a_batch_grow_together(wall_world):
     )
     assert found.stopped_each == (StopReason.ITERATIONS,) * 2
     assert found.tree.q.shape == (2, 160, 7) and np.all(np.asarray(found.tree.size) > 40)
+    iteration, _, _, size, cost, checked = found.history[-1]
+    assert iteration == 6 and size == np.max(found.tree.size) and np.isinf(cost)
+    assert checked == np.max(found.tree.checked) > 6 * 32

@@ -25,7 +25,7 @@ def finished(tree):
     return SearchResult(
         tree=tree,
         stopped=StopReason.REACHED,
-        history=np.zeros((1, 4)),
+        history=np.zeros((1, 6)),
         compile_s=0.0,
         search_s=0.0,
     )

@@ -22,7 +22,7 @@ KEY = jax.random.key(0)
 def is_path_free(world, path):
     steps = num_checks(world, 3.0)
     edge = world.edge(jnp.asarray(path[:-1]), jnp.asarray(path[1:]))
-    return bool(jnp.all(free_prefix(world, jnp.asarray(path[:-1]), edge, steps) == steps))
+    return bool(jnp.all(free_prefix(world, jnp.asarray(path[:-1]), edge, steps)[0] == steps))
 
 
 def grown(world, iterations):
@@ -98,7 +98,7 @@ def test_a_goal_behind_walls_has_no_way(slider):
     world = vrrt_jax.build_world(slider, [box], engine="closed_form")
     tree = trees.create(jnp.float32([[-0.5]]), jnp.zeros(1), None, 8)
     found = SearchResult(
-        tree=tree, stopped=StopReason.CONVERGED, history=np.zeros((1, 4)), compile_s=0, search_s=0
+        tree=tree, stopped=StopReason.CONVERGED, history=np.zeros((1, 6)), compile_s=0, search_s=0
     )
     few = CONFIG.changed({"tree.lanes": 4, "tree.capacity": 64, "budget.connect_iterations": 5})
     goal = np.array([0.5], np.float32)

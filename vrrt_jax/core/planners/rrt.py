@@ -8,7 +8,7 @@ import numpy as np
 
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import Space, num_checks
-from vrrt_jax.core.goal import ConfigurationGoal
+from vrrt_jax.core.goal import REACHED, ConfigurationGoal
 from vrrt_jax.core.types import Expansion, Proposals, PytreeSubclasses, Tree, pytree, static
 
 
@@ -80,8 +80,12 @@ class RRT(PytreeSubclasses):
         return self.with_sub_steps(world, tree, proposals.parent, expansion.q, expansion.accepted)
 
     def extract_path(self, tree: Tree) -> np.ndarray | None:
-        """The path (P, D) to the node nearest to the goal."""
-        return trees.best_path(tree)
+        """The path (P, D) to the cheapest node at the goal, or else to the node nearest to it."""
+        return trees.best_path(tree, REACHED)
+
+    def path_cost(self, tree: Tree, threshold: jax.Array) -> jax.Array:
+        """Length () of the shortest path to the goal, inf if there is none yet."""
+        return trees.path_cost(tree, threshold)
 
     def sample_aims(
         self, world: Space, goal: ConfigurationGoal, tree: Tree, key: jax.Array

@@ -203,10 +203,22 @@ class RRTConnect:
 
     def halves(self, tree: Tree[ConnectNode]) -> tuple[np.ndarray, np.ndarray] | None:
         """Nodes from the start, and from the goal, to where the trees met; None if they did not."""
-        best = int(np.argmin(tree.score))
-        other = int(tree.payload.meets[best])
-        if other < 0:
+        cost = _costs(tree)
+        best = int(jnp.argmin(cost))
+        if not np.isfinite(cost[best]):
             return None
+        other = int(tree.payload.meets[best])
         if int(tree.payload.side[best]) == 1:
             best, other = other, best
         return trees.lineage(tree, best), trees.lineage(tree, other)
+
+    def path_cost(self, tree: Tree[ConnectNode], threshold: jax.Array) -> jax.Array:
+        """Length () of the shortest path through a place where the trees met, inf if none did."""
+        return jnp.min(_costs(tree))
+
+
+def _costs(tree: Tree[ConnectNode]) -> jax.Array:
+    """Lengths (N,) of the paths through nodes where the trees met, both halves; inf elsewhere."""
+    other = tree.payload.meets
+    met = trees.occupied(tree) & (other >= 0)
+    return jnp.where(met, tree.cost + tree.cost[jnp.maximum(other, 0)], jnp.inf)
