@@ -91,6 +91,7 @@ class _Log:
 
     def __init__(self):
         self.edges = self.checks = 0
+        self.kept: Any = None
         self.steps: list[tuple[float, int, int, float]] = []
         self._best, self._planner, self._started = np.inf, None, 0.0
 
@@ -156,7 +157,9 @@ def _setup(
             return bool(free)
 
     setup.setStateValidityChecker(is_free)
-    own.setMotionValidator(Edges(own))
+    log.kept = Edges(own)  # OMPL keeps no reference to it
+    own.setMotionValidator(log.kept)
+    own.setup()  # before states are made of numbers
     states = []
     for q in ends:
         state = space.allocState()
