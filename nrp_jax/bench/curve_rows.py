@@ -73,7 +73,7 @@ def run_item(setting: Setting, item: Item) -> dict[str, Any]:
         if item.planner in ompl_peers.PEERS:
             return row | ompl_peers.solve(
                 robot,
-                home.grid,
+                world,
                 scene,
                 start,
                 goal,

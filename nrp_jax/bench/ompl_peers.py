@@ -2,36 +2,37 @@
 
 A state of OMPL is the base beside the arm, in the planners' own metric: the way of the base, for
 the Fetch along Reeds-Shepp curves, plus the weighted way of the arm. Joints that turn for ever are
-intervals here. OMPL asks for one edge at a time. It is checked in one compiled call, at the
-resolution of the planners; that call, from Python, is most of a peer's time.
+intervals here. OMPL asks for one edge at a time. It is checked in one compiled call, twice as
+finely as the planners do, as nothing is planned again where the exact check refuses a path; that
+call, from Python, is most of a peer's time.
 """
 
 import dataclasses
+import functools
 import time
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nrp_jax.homes.grid import Grid
 from nrp_jax.scene.exact import ExactScene, verify
 from nrp_jax.scene.nearest import shifted, working_world
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.trajectory import with_waypoints
-from nrp_jax.scene.world import TURNING_RADIUS, GridWorld, batch_is_free, build_world
+from nrp_jax.scene.world import TURNING_RADIUS, GridWorld, batch_is_free
 from vrrt_jax.core.peers import load_ompl
 from vrrt_jax.core.postprocess import CheckedPath, postprocess
 from vrrt_jax.core.shortcut import path_length
 
 PEERS = ("RRTConnect", "AORRTC", "BITstar", "InformedRRTstar")  # the first ends with its first path
+RANGE = 1.0  # [m] longest edge of those that have one; OMPL's own, a fifth of the space, is blocked
 _BLOCK = 32  # configurations of an edge that are checked together
 
 
 def solve(
     robot: MobileRobot,
-    grid: Grid,
+    world: GridWorld,
     scene: ExactScene,
     q_start: np.ndarray,
     q_goal: np.ndarray,
@@ -44,26 +45,33 @@ def solve(
 
     Args:
         robot: from :func:`nrp_jax.load_robot`.
-        grid: the home.
+        world: the robot in a home.
         scene: of both.
         q_start: (D,) free configuration [m] and [rad].
         q_goal: (D,) free configuration.
         name: one of :data:`PEERS`.
         budget_s: of the search [s].
-        key: of the shortcuts, and, where it is the first of this process, of OMPL.
+        key: of the shortcuts; OMPL goes on with its own random numbers in each process.
 
     Returns:
         What :func:`nrp_jax.bench.curve_rows.run_item` tells of a planner; an expansion is an edge
         that was checked.
     """
-    ompl = load_ompl(int(np.asarray(jax.random.key_data(key))[-1] % 2**31))
-    world, corner = working_world(build_world(robot, grid, wrap=False))
-    turned = working_world(build_world(robot, grid))[0].normalize
-    ends = [turned(jnp.asarray(shifted(q, -corner), jnp.float32)) for q in (q_start, q_goal)]
-    setup, planner, log = _setup(ompl, robot, world, [np.asarray(q, float) for q in ends], name)
+    ompl = load_ompl(0)
+    # Arms do not turn for ever here: their joints begin within half a turn.
+    world, corner = working_world(world)
+    ends = [shifted(q, -corner).astype(np.float32) for q in (q_start, q_goal)]
+    ends = [np.asarray(world.normalize(jnp.asarray(q)), float) for q in ends]
+    is_base = np.arange(robot.num_joints) < robot.base_dim
+    world = dataclasses.replace(
+        world, is_continuous=world.is_continuous & is_base, resolution=world.resolution / 2
+    )
+    setup, planner, log = _setup(ompl, robot, world, ends, name)
     log.begin(planner)
     setup.solve(ompl.base.timedPlannerTerminationCondition(budget_s))
     searched_s = log.seconds()
+    # The search and its validator hold each other, and are never freed unless they are parted.
+    setup.getSpaceInformation().setMotionValidator(_idle_validator())
     row = {
         "solved": False,
         "status": "TIME_LIMIT",
@@ -77,8 +85,7 @@ def solve(
         states = setup.getSolutionPath().getStates()
         raw = np.array([_numbers(robot, state) for state in states], np.float32)
         log.note(path_length(world, raw), searched_s)
-        finer = dataclasses.replace(world, resolution=world.resolution / 2)
-        done = postprocess(finer, raw, partial(_checked, world, scene, corner), key=key)
+        done = postprocess(world, raw, functools.partial(_checked, world, scene, corner), key=key)
         row |= {"status": "NOT_VERIFIED", "refused": done.refused}
         if done.is_verified:
             cost = round(float(path_length(world, done.checked.path)), 4)
@@ -86,12 +93,18 @@ def solve(
     return row | {"steps": np.round(np.reshape(log.steps, (-1, 4)), 4).tolist()}
 
 
+@functools.cache
+def _idle_validator() -> Any:
+    """A validator of edges that nothing asks."""
+    base = load_ompl(0).base
+    return base.ReedsSheppMotionValidator(base.SpaceInformation(base.ReedsSheppStateSpace(1.0)))
+
+
 class _Log:
     """What a planner has done so far; its best path is looked for after each edge."""
 
     def __init__(self):
         self.edges = self.checks = 0
-        self.kept: Any = None
         self.steps: list[tuple[float, int, int, float]] = []
         self._best, self._planner, self._started = np.inf, None, 0.0
 
@@ -157,8 +170,7 @@ def _setup(
             return bool(free)
 
     setup.setStateValidityChecker(is_free)
-    log.kept = Edges(own)  # OMPL keeps no reference to it
-    own.setMotionValidator(log.kept)
+    own.setMotionValidator(Edges(own))
     own.setup()  # before states are made of numbers
     states = []
     for q in ends:
@@ -174,6 +186,8 @@ def _setup(
     objective.lock()
     setup.setOptimizationObjective(objective)
     planner = getattr(ompl.geometric, name)(own)
+    if hasattr(planner, "setRange"):
+        planner.setRange(RANGE)
     setup.setPlanner(planner)
     setup.setup()
     is_free(states[0])
