@@ -36,7 +36,7 @@ def write_page(files: Sequence[Path], folder: Path) -> Path:
             f"## {task}: {file.name}",
             "",
             f"`{results['command']}`, cores a plan: {here['cores']} of {here['processor']}, "
-            f"{len(results['homes'])} homes, runs: {results['runs']}",
+            f"homes: {len(results['homes'])}, runs: {results['runs']}",
             "",
             to_text(results),
             "",
@@ -117,7 +117,7 @@ def _figure(results: Mapping[str, Any], path: Path) -> None:
     )
     figure.legend(*axes[0].get_legend_handles_labels(), ncols=5, loc="outside lower center")
     numbers = {found["n"] for found in results["planners"].values()}
-    figure.suptitle(f"{results['task']}, {len(results['homes'])} homes, n = {max(numbers)}")
+    figure.suptitle(f"{results['task']}, homes: {len(results['homes'])}, n = {max(numbers)}")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
