@@ -1,4 +1,4 @@
-"""The ``nrp`` command: homes, data, train, score, plan, bench."""
+"""The ``nrp`` command: homes, data, train, score, plan, bench, report."""
 
 import argparse
 import json
@@ -17,7 +17,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from nrp_jax.bench import checks, planning, score
+    from nrp_jax.bench import checks, curves, planning, report, score
     from nrp_jax.homes import figure
     from nrp_jax.learning import data, train
 
@@ -25,12 +25,12 @@ def _parser() -> argparse.ArgumentParser:
         prog="nrp", description="Motion planning in homes, with learned samplers."
     )
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (figure, data, train, score):
+    for module in (figure, data, train, score, report):
         module.add_arguments(commands)
     _add_plan(commands)
     bench = commands.add_parser("bench", help="measure speed and success")
     benches = bench.add_subparsers(dest="what", required=True)
-    for module in (checks, planning):
+    for module in (checks, planning, curves):
         module.add_arguments(benches)
     return parser
 
