@@ -20,8 +20,9 @@ from vrrt_jax.robots.self_collision import (
 )
 from vrrt_jax.robots.self_collision_fit import fit_to_sample
 
-_CONFIGURATIONS = 100_000  # for self-collision
+_CONFIGURATIONS = 40_000  # for self-collision
 _LEAF = 3e-4  # [m] size of the smallest triangle when the cover is proven
+_PROBE = 3  # spheres with which the bodies are compared
 _SELF_SPACING = 0.05  # [m] of the longest side of a body, for each self-collision sphere
 _MOST_SELF = 12  # self-collision spheres of one body
 
@@ -69,6 +70,8 @@ def fit_spheres(
     proven = {
         body: contain_surface(pieces[body], *fitted[body], leaf=_LEAF) for body in sorted(fitted)
     }
+    # Randomness of its own, so that another number of collision spheres changes nothing here.
+    rng = np.random.default_rng([seed, 1])
     sample = sample_self_collisions(model, _CONFIGURATIONS, rng)
     ignored_pairs = find_ignored_pairs(model, sample)
     write = functools.partial(
@@ -140,29 +143,28 @@ def _share_out(
     rng: np.random.Generator,
     progress: Callable[[str], None],
 ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Give one sphere after another to the body where it saves the most false alarms."""
+    """Give spheres to the bodies where they save most false alarms, and fit them."""
     if num_spheres < len(samples):
         raise ValueError(
             f"num_spheres is {num_spheres}; expected at least one for each of the {len(samples)} "
             "moving bodies"
         )
-    found = {body: [sphere_fit.fit_body(own, 1, rng)] for body, own in samples.items()}
+    # A few spheres tell how hard a body is to cover: twice as many leave about half the volume.
+    volume = {
+        body: _PROBE * sphere_fit.fit_body(own, _PROBE, rng)[2] for body, own in samples.items()
+    }
     used = dict.fromkeys(samples, 1)
     while sum(used.values()) < num_spheres:
-        gains = {}
-        for body, own in samples.items():
-            # two more at once may help where one more does not: rings, bent links
-            for more in (1, 2):
-                count = used[body] + more
-                if count > sphere_fit.MAX_SPHERES or sum(used.values()) + more > num_spheres:
-                    continue
-                if count > len(found[body]):
-                    found[body].append(sphere_fit.fit_body(own, count, rng))
-                saved = found[body][used[body] - 1][2] - found[body][count - 1][2]
-                gains[body, more] = saved / more
-        if not gains:
+        saved = {
+            body: volume[body] / (count * (count + 1))
+            for body, count in used.items()
+            if count < sphere_fit.MAX_SPHERES
+        }
+        if not saved:
             break
-        body, more = max(gains, key=lambda key: gains[key])
-        used[body] += more
-        progress(f"{sum(used.values())} of {num_spheres} spheres")
-    return {body: found[body][count - 1][:2] for body, count in used.items()}
+        used[max(saved, key=lambda body: saved[body])] += 1
+    fitted = {}
+    for body, count in used.items():
+        fitted[body] = sphere_fit.fit_body(samples[body], count, rng)[:2]
+        progress(f"body {body}: {count} spheres")
+    return fitted

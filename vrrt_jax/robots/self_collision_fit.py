@@ -15,11 +15,11 @@ from vrrt_jax.robots.convex_parts import STEP
 from vrrt_jax.robots.kinematics import BodySpheres
 
 _ROUNDS = 2  # of choosing the pairs that nearly touch, and of descending
-_STEPS = 400
+_STEPS = 300
 _NEAREST = 16  # pairs of spheres considered in one configuration
-_MAX_ROWS = 12_000  # configurations of one descent
+_MAX_ROWS = 4000  # configurations of one descent that collide, and as many that nearly do
 _SHRINK = 0.007  # [m] to start with: covering spheres stick out by about as much
-_FREE_UP_TO, _COLLIDING_UP_TO = 0.005, 0.02  # [m] gaps and depths beyond these teach nothing
+_NEAR = 0.005  # [m] free configurations with more room between spheres teach nothing
 _MISS_COST = 20.0  # false alarms that one missed self-collision is worth
 _MIN_DEPTH = 1e-3  # [m] that spheres should be in each other where the robot collides
 _MIN_RADIUS = 2e-3  # [m]
@@ -51,12 +51,11 @@ def fit_to_sample(
     frames = _body_frames(model, configurations)
     first, second = spheres.body[pairs].T
     for _ in range(_ROUNDS):
-        # What just touches or just does not, and by which spheres.
+        # What collides or nearly does, and by which spheres.
         depth = _depths(frames, spheres.body, center, radius, pairs)
-        deepest = depth.max(axis=1)
-        is_near = np.where(is_colliding, deepest < _COLLIDING_UP_TO, deepest > -_FREE_UP_TO)
-        rows = np.flatnonzero(is_near)
-        rows = rows[:: 1 + len(rows) // _MAX_ROWS]
+        near_misses = np.flatnonzero(~is_colliding & (depth.max(axis=1) > -_NEAR))
+        groups = (np.flatnonzero(is_colliding), near_misses)
+        rows = np.concatenate([rows[:: 1 + len(rows) // _MAX_ROWS] for rows in groups])
         num = min(_NEAREST, len(pairs))
         nearest = np.argpartition(-depth[rows], num - 1, axis=1)[:, :num]
         # The second sphere's body in the frame of the first one's.
