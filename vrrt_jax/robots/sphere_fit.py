@@ -39,7 +39,8 @@ class BodySamples:
     """Points around a body, in its frame."""
 
     surface: np.ndarray  # (s, 3) dense, to be covered [m]
-    inside: np.ndarray  # (p, 3) some of the surface and of the interior [m]
+    inside: np.ndarray  # (p, 3) some of the surface, then some of the interior [m]
+    num_surface: int  # of the former
     outside: np.ndarray  # (x, 3) centers of balls that do not touch the robot [m]
     ball: np.ndarray  # (x,) their radii [m]
     cell: float  # volume that each outside point stands for, less where few obstacles are [m^3]
@@ -68,6 +69,7 @@ def sample_bodies(
         samples[body] = BodySamples(
             surface=surfaces[body],
             inside=np.vstack([surface, interior]),
+            num_surface=len(surface),
             outside=outside,
             ball=ball,
             cell=share * cell,
@@ -160,7 +162,10 @@ def fit_body(
     Returns:
         Centers (num, 3) and radii (num,) [m], and the volume of false alarms [m^3].
     """
-    starts = [_start(samples.inside, num, rng) for _ in range(_STARTS)]
+    # Clusters of the interior are slices along a long body, those of the surface are patches.
+    whole, interior = samples.inside, samples.inside[samples.num_surface :]
+    sources = [interior if k % 2 == 0 and len(interior) else whole for k in range(_STARTS)]
+    starts = [_start(source, whole, num, rng) for source in sources]
     fitted = _descended(samples, *(np.array(part) for part in zip(*starts, strict=True)))
     # Of all starts keep the one with the least false alarms, once every sample is covered.
     best = min((_covering(samples, *spheres) for spheres in fitted), key=lambda found: found[2])
@@ -211,15 +216,17 @@ def _descended(
     return list(zip(centers, radii, strict=True))
 
 
-def _start(points: np.ndarray, num: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Spheres around the clusters that k-means finds."""
-    points = points[rng.choice(len(points), 800)]
-    centers = points[rng.choice(len(points), num, replace=False)]
+def _start(
+    clustered: np.ndarray, points: np.ndarray, num: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Spheres around the clusters that k-means finds, each as large as the points next to it ask."""
+    clustered = clustered[rng.choice(len(clustered), 800)]
+    centers = clustered[rng.choice(len(clustered), num, replace=False)]
     # Lloyd's iterations of k-means.
     for _ in range(15):
-        nearest = np.linalg.norm(points[:, None] - centers, axis=-1).argmin(1)
+        nearest = np.linalg.norm(clustered[:, None] - centers, axis=-1).argmin(1)
         for k in np.unique(nearest):
-            centers[k] = points[nearest == k].mean(0)
+            centers[k] = clustered[nearest == k].mean(0)
     distance = np.linalg.norm(points[:, None] - centers, axis=-1)
     nearest = distance.argmin(1)
     radii = [distance[nearest == k, k].max(initial=0.02) for k in range(num)]
@@ -252,7 +259,7 @@ def _descend(
         # Soft counts of false alarms, which get sharper, and a penalty on bare points, which grows.
         width = 0.006 * (1 - progress) + 0.0015 * progress
         alarms = jnp.mean(jax.nn.sigmoid((ball - distance(spheres, outside)) / width))
-        bare = jax.nn.relu(distance(spheres, inside) + 3e-4) / 1e-3
+        bare = jax.nn.relu(distance(spheres, inside) + 3e-4) / 5e-3
         return alarms + (0.3 + 3 * progress) * (jnp.mean(bare**2) + 0.002 * jnp.max(bare) ** 2)
 
     def step(carry, progress):
