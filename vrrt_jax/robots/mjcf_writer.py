@@ -111,8 +111,8 @@ def replace_spheres(text: str, fitted: str) -> str:
             body.insert(place, geom)
     # The comment says where the spheres come from.
     for tag in (ET.Comment, "contact"):
-        new = next(part for part in other if part.tag == tag)
-        root[[part.tag for part in root].index(tag)] = new
+        place = next(k for k, part in enumerate(root) if part.tag == tag)
+        root[place] = next(part for part in other if part.tag == tag)
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
 

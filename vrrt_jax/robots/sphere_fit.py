@@ -166,7 +166,8 @@ def fit_body(
     whole, interior = samples.inside, samples.inside[samples.num_surface :]
     sources = [interior if k % 2 == 0 and len(interior) else whole for k in range(_STARTS)]
     starts = [_start(source, whole, num, rng) for source in sources]
-    fitted = _descended(samples, *(np.array(part) for part in zip(*starts, strict=True)))
+    centers, radii = (np.array(part) for part in zip(*starts, strict=True))
+    fitted = _descended(samples, centers, radii)
     # Of all starts keep the one with the least false alarms, once every sample is covered.
     best = min((_covering(samples, *spheres) for spheres in fitted), key=lambda found: found[2])
     for _ in range(_ROUNDS):
@@ -219,7 +220,7 @@ def _descended(
 def _start(
     clustered: np.ndarray, points: np.ndarray, num: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Spheres around the clusters that k-means finds, each as large as the points next to it ask."""
+    """Spheres around the clusters that k-means finds, so large that they reach their points."""
     clustered = clustered[rng.choice(len(clustered), 800)]
     centers = clustered[rng.choice(len(clustered), num, replace=False)]
     # Lloyd's iterations of k-means.
