@@ -84,7 +84,7 @@ def measure_spheres(
     return SphereReport(
         obstacles=_agreement(found[:, 0], found[:, 2]),
         self_collision=_agreement(found[:, 1], found[:, 3]),
-        either=_agreement(found[:, :2].any(axis=1), found[:, 2:].any(axis=1)),
+        either=_agreement(found[:, 0] | found[:, 1], found[:, 2] | found[:, 3]),
         num=num,
         seed=seed,
         missed=missed,
