@@ -71,12 +71,25 @@ def _parser() -> argparse.ArgumentParser:
     spheres.set_defaults(run=_spheres, out_is_file=True)
     add_robot(spheres)
     spheres.add_argument("--out", help="the MJCF file to write; only measured without it")
+    spheres.add_argument(
+        "--into",
+        help="an MJCF file that the command wrote: its joints and home stay, spheres are replaced",
+    )
     spheres.add_argument("--seed", type=command.seed, default=0, help="of fit and measurement")
+    spheres.add_argument(
+        "--spheres",
+        type=command.whole(1, 200),
+        default=44,
+        help="collision spheres to fit, on all moving links together",
+    )
     spheres.add_argument(
         "--num",
         type=command.whole(1, 10_000_000),
         default=10_000,
         help="configurations to measure on",
+    )
+    spheres.add_argument(
+        "--worlds", nargs="+", help="MJCF files to measure among; else random scenes"
     )
 
     bench = commands.add_parser("bench", help="measure speed, success or settings")
@@ -236,20 +249,29 @@ def _fit(arguments: argparse.Namespace) -> int:
 
 def _spheres(arguments: argparse.Namespace) -> int:
     from vrrt_jax.robots import load_robot
+    from vrrt_jax.robots.mjcf_writer import replace_spheres
     from vrrt_jax.robots.robot_fit import fit_spheres
+    from vrrt_jax.scene.obstacles import load_obstacles
     from vrrt_jax.scene.sphere_errors import measure_spheres
 
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
     if arguments.out is not None:
-        Path(arguments.out).write_text(fit_spheres(robot, seed=arguments.seed, progress=print))
+        text = fit_spheres(
+            robot, num_spheres=arguments.spheres, seed=arguments.seed, progress=print
+        )
+        if arguments.into is not None:
+            text = replace_spheres(Path(arguments.into).read_text(), text)
+        Path(arguments.out).write_text(text)
         print(f"wrote {arguments.out}")
         robot = load_robot(arguments.out)
-    measured = measure_spheres(robot, num=arguments.num, seed=arguments.seed)
+    scenes = [load_obstacles(path) for path in arguments.worlds or ()]
+    measured = measure_spheres(robot, arguments.num, arguments.seed, scenes)
     covering, thin = robot.collision_spheres.radius, robot.self_collision_spheres.radius
     print(f"{len(covering)} covering and {len(thin)} thin spheres")
     for name, counts in (
         ("against obstacles", measured.obstacles),
         ("against itself", measured.self_collision),
+        ("in one count", measured.either),
     ):
         print(
             f"{name}: {counts.misses} of {counts.colliding} collisions missed, "
