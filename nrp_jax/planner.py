@@ -12,6 +12,7 @@ import numpy as np
 from nrp_jax.config import EDGE_STEPS, PlannerConfig
 from nrp_jax.homes.grid import Grid
 from nrp_jax.planners.nrp import NeuralRRT
+from nrp_jax.planners.nrp_star import NeuralRRTStar
 from nrp_jax.samplers import check_fits, load_sampler
 from nrp_jax.scene.configurations import check_configuration
 from nrp_jax.scene.exact import ExactScene, verify
@@ -23,7 +24,7 @@ from vrrt_jax.core.check_protocols import check_extracted_path, check_policy
 from vrrt_jax.core.edges import nearest_turn
 from vrrt_jax.core.goal import ConfigurationGoal, starts_at
 from vrrt_jax.core.interrupt import interruptible
-from vrrt_jax.core.planners import RRT, RRTConnect
+from vrrt_jax.core.planners import RRT, BITStar, InformedRRTStar, RRTConnect, RRTStar
 from vrrt_jax.core.postprocess import CheckedPath, plan_result, postprocess, unchecked
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import STATUS_OF, PlanResult, Status
@@ -31,8 +32,26 @@ from vrrt_jax.core.search import SearchResult, make_termination, no_search, sear
 from vrrt_jax.core.settings import check_settings
 from vrrt_jax.core.types import ExpansionPolicy
 
-PLANNERS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g")
-KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae"}  # of the samplers that planners need
+# Those of the second row go on to improve their paths until the budget ends.
+PLANNERS = (
+    *("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g"),
+    *("rrt-star", "irrt-star", "bit-star", "nrp-star-d", "nrp-star-g"),
+)
+# Of the samplers that planners need.
+KINDS = {
+    "nrp-d": "discriminator",
+    "nrp-g": "cvae",
+    "nrp-star-d": "discriminator",
+    "nrp-star-g": "cvae",
+}
+# How the trees of the second row are rewired.
+REWIRING = {
+    "rewire_radius": np.float32(np.inf),
+    "rewire_steps": 32,
+    "neighbors": 8,
+    "tries": 4,
+    "ancestors": 4,
+}
 ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
 ADVICE = {
     Status.SOLVED: "",
@@ -227,10 +246,18 @@ def _policy(
     shape = {"keep_partial": True, "lanes": config.lanes, "edge_steps": EDGE_STEPS}
     if planner in ("rrt", "rrt-is"):
         return RRT(goal_bias=bias, intermediate=planner == "rrt-is", **shape)
+    if planner == "bit-star":
+        return BITStar(lanes=config.lanes, edge_steps=EDGE_STEPS)
+    if planner in ("rrt-star", "irrt-star"):
+        make = RRTStar if planner == "rrt-star" else InformedRRTStar
+        return make(goal_bias=bias, **shape, **REWIRING)
     sampler = load_sampler(robot.name, KINDS[planner]) if sampler is None else sampler
     check_fits(sampler, robot, world, KINDS[planner])
     rate = jnp.float32(config.straight_rate)
-    return NeuralRRT(goal_bias=bias, sampler=sampler, straight_rate=rate, **shape)
+    learned = {"goal_bias": bias, "sampler": sampler, "straight_rate": rate, **shape}
+    if planner.startswith("nrp-star"):
+        return NeuralRRTStar(**learned, **REWIRING)
+    return NeuralRRT(**learned)
 
 
 def _finish(
