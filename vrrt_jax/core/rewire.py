@@ -54,48 +54,42 @@ def rewire(
     Returns:
         The tree with new parents, and costs that are right for all nodes.
     """
-    # Which old nodes (B, N) are near which new ones. Rejected lanes stand in at node 0.
+    # Old nodes (B, K) near the new ones, and how far; +inf where they are not. Rejected lanes stand
+    # in at node 0. The barrier keeps XLA from computing the distances once for every use.
     radius = jnp.minimum(radius, edge_steps * world.resolution)
-    distances = trees.distances(world, tree, expansion.q)
+    apart = jax.lax.optimization_barrier(trees.distances(world, tree, expansion.q))
     is_old = jnp.arange(tree.capacity) < tree.size - jnp.sum(expansion.accepted)
-    near = expansion.accepted[:, None] & is_old & (distances < radius)
+    apart = jnp.where(expansion.accepted[:, None] & is_old & (apart < radius), apart, jnp.inf)
+    old = jnp.broadcast_to(jnp.arange(tree.capacity), apart.shape)
     if neighbors is not None:
-        nearest, _ = jax.lax.top_k(-jnp.where(near, distances, jnp.inf), neighbors)
-        near &= distances <= -nearest[:, -1:]
+        nearness, old = jax.lax.top_k(-apart, neighbors)
+        apart = -nearness
     new = jnp.where(expansion.accepted, expansion.node_index, 0)
 
-    # Choose parents: what a new node (B, K) would save with another one, for the free edges.
-    saving = jnp.where(near, tree.cost[new][:, None] - tree.cost - distances, -jnp.inf)
-    saving, old = jax.lax.top_k(saving, tries)
+    # Choose parents: what a new node (B, tries) would save with another one, for the free edges.
+    saving, choice = jax.lax.top_k(tree.cost[new][:, None] - tree.cost[old] - apart, tries)
+    better = jnp.take_along_axis(old, choice, axis=1)
     if ancestors:
         saving_up, up = _ancestors(world, tree, expansion, new, ancestors)
-        saving, old = (jnp.concatenate(pair, axis=1) for pair in ((saving, saving_up), (old, up)))
-    free, checked_parents = _free_gains(
-        world,
-        saving,
-        tree.q[old],
-        jnp.broadcast_to(expansion.q[:, None], tree.q[old].shape),
-        edge_steps,
-        checks,
-    )
+        saving, better = (
+            jnp.concatenate(pair, axis=1) for pair in ((saving, saving_up), (better, up))
+        )
+    q_new = jnp.broadcast_to(expansion.q[:, None], (*better.shape, expansion.q.shape[1]))
+    free, checked_parents = _free_gains(world, saving, tree.q[better], q_new, edge_steps, checks)
     # The free edge that saves most. Writes to slot N are dropped: lanes without one write nothing.
     free_saving = jnp.where(free, saving, 0.0)
     best, most = jnp.argmax(free_saving, axis=1), jnp.max(free_saving, axis=1)
     slot = jnp.where(most > 0, expansion.node_index, tree.capacity)
-    chosen = jnp.take_along_axis(old, best[:, None], axis=1)[:, 0]
+    chosen = jnp.take_along_axis(better, best[:, None], axis=1)[:, 0]
     parent = tree.parent.at[slot].set(chosen.astype(jnp.int32), mode="drop")
     cost = tree.cost.at[slot].add(-most, mode="drop")
 
     # Rewire: the old nodes that gain most from each new one. The main root keeps its place.
-    gain = jnp.where(near, cost - cost[new][:, None] - distances, -jnp.inf).at[:, 0].set(-jnp.inf)
-    gain, child = jax.lax.top_k(gain, tries)
+    gain = jnp.where(old > 0, cost[old] - cost[new][:, None] - apart, -jnp.inf)
+    gain, choice = jax.lax.top_k(gain, tries)
+    child = jnp.take_along_axis(old, choice, axis=1)
     free, checked_children = _free_gains(
-        world,
-        gain,
-        jnp.broadcast_to(expansion.q[:, None], tree.q[child].shape),
-        tree.q[child],
-        edge_steps,
-        checks,
+        world, gain, q_new[:, :tries], tree.q[child], edge_steps, checks
     )
     wins = winners(child.reshape(-1), jnp.where(free, gain, 0.0).reshape(-1), tree.capacity)
     parent = parent.at[jnp.where(wins, child.reshape(-1), tree.capacity)].set(
