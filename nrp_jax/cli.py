@@ -43,7 +43,10 @@ def _add_plan(commands) -> None:
     plan.add_argument("--start", type=command.numbers, required=True, help="as --start=1,2.5,0,...")
     plan.add_argument("--goal", type=command.numbers, required=True, help="as --goal=...")
     plan.add_argument(
-        "--method", default="rrt-connect", help="rrt, rrt-is, rrt-connect, nrp-d or nrp-g"
+        "--method",
+        default="rrt-connect",
+        help="rrt, rrt-is, rrt-connect, nrp-d or nrp-g; rrt-star, irrt-star, bit-star, nrp-star-d or "
+        "nrp-star-g shorten the path until the budget ends",
     )
     plan.add_argument("--model", help="what nrp train wrote; packaged weights by default")
     plan.add_argument("--crop", type=command.numbers, help="plan in x0,y0,x1,y1 of the map [m]")

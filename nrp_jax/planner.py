@@ -84,6 +84,10 @@ def plan(
 ) -> PlanResult:
     """Find a collision-free path between two configurations in a home.
 
+    Planners that improve their paths ("rrt-star", "irrt-star", "bit-star", "nrp-star-d" and
+    "nrp-star-g") go on until ``max_expansions`` or ``time_limit_s``, whichever ends first; column 4
+    of ``history`` is the length of the path over time.
+
     Should the path that was found touch something between two of the planner's checks, it plans
     again with checks twice as fine, up to twice, with what is left of the budgets.
 
@@ -96,7 +100,7 @@ def plan(
         planner: one of :data:`PLANNERS`, or a policy of the kernel, see
             :class:`~vrrt_jax.core.types.ExpansionPolicy`.
         method: another word for ``planner``.
-        sampler: what proposes waypoints to "nrp-d" and "nrp-g": a pytree with ``propose(world,
+        sampler: what proposes waypoints to the "nrp-" planners: a pytree with ``propose(world,
             q_from, q_goal, key)``; the packaged weights by default.
         world: of this robot and grid, to save building it again; its ``is_free`` is obeyed.
         scene: the exact scene of this robot and grid, to save building it again.
@@ -125,6 +129,10 @@ def plan(
             f"capacity is {config.capacity}; expected at least {policy.lanes + 2}, two more than "
             "the lanes: raise it or lower lanes"
         )
+    # Shorter paths keep closer to obstacles, and a planner that goes on until its budget ends has
+    # none left to plan again: its checks are twice as fine from the first.
+    if policy.goal_score(goal) == -np.inf:
+        world = dataclasses.replace(world, resolution=world.resolution / 2)
     tree = policy.init(world, goal, np.asarray(start)[None], config.capacity)
     scene = scene or ExactScene(robot, grid)
     if starts_at(goal, world, start):
