@@ -45,8 +45,8 @@ def _add_plan(commands) -> None:
     plan.add_argument(
         "--method",
         default="rrt-connect",
-        help="rrt, rrt-is, rrt-connect, nrp-d or nrp-g; rrt-star, irrt-star, bit-star, nrp-star-d or "
-        "nrp-star-g shorten the path until the budget ends",
+        help="rrt, rrt-is, rrt-connect, nrp-d or nrp-g; or, to shorten the path until the budget "
+        "ends, rrt-star, irrt-star, bit-star, nrp-star-d or nrp-star-g",
     )
     plan.add_argument("--model", help="what nrp train wrote; packaged weights by default")
     plan.add_argument("--crop", type=command.numbers, help="plan in x0,y0,x1,y1 of the map [m]")

@@ -150,6 +150,8 @@ def with_costs(world: Space, tree: Tree[Payload]) -> Tree[Payload]:
     ancestor = jnp.where(has_parent, tree.parent, jnp.arange(tree.capacity))
     length = jnp.where(has_parent, distance(world, tree.q[ancestor], tree.q), 0.0)
     # After k rounds every node knows its ancestor 2^k generations up, and the length to there.
-    for _ in range(max(tree.capacity - 1, 1).bit_length()):
-        length, ancestor = length + length[ancestor], ancestor[ancestor]
+    rounds = max(tree.capacity - 1, 1).bit_length()
+    length, ancestor = jax.lax.fori_loop(
+        0, rounds, lambda _, way: (way[0] + way[0][way[1]], way[1][way[1]]), (length, ancestor)
+    )
     return dataclasses.replace(tree, cost=tree.cost[ancestor] + length)
