@@ -45,7 +45,7 @@ def solve(snake):
     def run(method, goal=GOAL, home=0, **options):
         grid, world, scene = homes[home]
         sampler = Halfway() if method == "nrp-star-d" else None
-        budget = {"capacity": 2048, "max_expansions": 1600, "goal_bias": 0.1, **options}
+        budget = {"capacity": 2048, "max_expansions": 3200, "goal_bias": 0.2, **options}
         shared = {"world": world, "scene": scene, "sampler": sampler, "key": jax.random.key(0)}
         return plan(snake, grid, START, goal, method=method, **shared, **budget)
 
@@ -78,7 +78,7 @@ def check_tree(world, tree):
 @pytest.mark.parametrize("method", STARS)
 def test_paths_get_shorter_until_the_budget_ends(solve, world, method):
     result = solve(method)
-    assert result.ok and result.expansions == 1600
+    assert result.ok and result.expansions == 3200
     cost = result.history[:, 4]
     first = cost[np.isfinite(cost)][0]
     assert np.all(cost[1:] <= cost[:-1] + 1e-4), "never worse than before"
