@@ -22,7 +22,8 @@ class BatchNode:
     """What BIT* keeps for a sample, whether a path leads to it yet or not."""
 
     to_goal: jax.Array  # (N,) distance to the goal
-    near: jax.Array  # (N, K) i32 the nearest of the samples before it, -1 if there are fewer
+    # (N, K) i32 the nearest of the samples before it, -1 if there are fewer; start and goal
+    near: jax.Array
     apart: jax.Array  # (N, K) how far these are
     blocked: jax.Array  # (N, K) bool, the edge to that one is known not to be free
 
@@ -45,7 +46,7 @@ class BITStar:
     :data:`~vrrt_jax.core.tree.UNREACHED`. Every lane tries one edge between two samples, those
     first that promise the shortest path from start to goal. When no edge is left that could
     shorten the best path, a new batch of the informed set is drawn. A sample has edges to its
-    ``neighbors`` nearest before it, which bounds the queue of edges.
+    nearest before it, to the start and to the goal, ``neighbors`` in all, which bounds the queue.
     """
 
     lanes: int = static(default=32)
@@ -178,9 +179,16 @@ class BITStar:
         nodes = dataclasses.replace(tree, q=tree.q.at[slots].set(q, mode="drop"))
         nodes = dataclasses.replace(nodes, size=tree.size + jnp.sum(valid))
         earlier = jnp.arange(tree.capacity) < own[:, None]
-        apart, near = jax.lax.top_k(-trees.distances(world, nodes, q, earlier), self.neighbors)
-        found = jnp.isfinite(apart)
+        nearness, near = jax.lax.top_k(
+            -trees.distances(world, nodes, q, earlier), self.neighbors - 2
+        )
+        # The start and the goal are near to all: in many dimensions they are hardly ever among the
+        # nearest, and the ends of the best path would stay as they are.
         to_goal = jax.vmap(lambda q: goal.loss(world, q))(q)
+        from_start = world.distance(jnp.broadcast_to(tree.q[0], q.shape), q)
+        near = jnp.concatenate([near, jnp.broadcast_to(jnp.arange(2), (self.batch, 2))], axis=1)
+        apart = jnp.concatenate([-nearness, from_start[:, None], to_goal[:, None]], axis=1)
+        found = jnp.isfinite(apart)
         tree, _ = trees.insert(
             tree,
             q=q,
@@ -190,7 +198,7 @@ class BITStar:
             payload=BatchNode(
                 to_goal=to_goal,
                 near=jnp.where(found, near, -1),
-                apart=jnp.where(found, -apart, 0.0),
+                apart=jnp.where(found, apart, 0.0),
                 blocked=jnp.zeros(near.shape, bool),
             ),
             valid=valid,
