@@ -47,7 +47,9 @@ def _add_plan(commands) -> None:
     plan.add_argument("--goal", type=command.numbers, help="as --goal=...")
     plan.add_argument(
         "--method",
-        help="rrt, rrt-is, rrt-connect, nrp-d, nrp-g, nrp-connect (default) or nrp-star-connect",
+        help="nrp-connect (default), rrt, rrt-is, rrt-connect, nrp-d or nrp-g; or, to shorten the "
+        "path until the budget ends, bit-star, rrt-star, irrt-star, nrp-star-d, nrp-star-g or "
+        "nrp-star-connect",
     )
     plan.add_argument("--model", help="what nrp train wrote; packaged weights by default")
     plan.add_argument("--crop", type=command.numbers, help="plan in x0,y0,x1,y1 of the map [m]")
@@ -69,7 +71,8 @@ def _add_plan(commands) -> None:
 def _plan(arguments: argparse.Namespace) -> int:
     import jax
 
-    from nrp_jax.planner import CONNECT, KINDS, plan
+    from nrp_jax.planner import plan
+    from nrp_jax.planners.by_name import CONNECT, KINDS
     from nrp_jax.planners.nrp_connect import UNCHECKED, default_planner
     from nrp_jax.samplers import load_sampler
     from nrp_jax.scene.world import build_world

@@ -20,7 +20,7 @@ from nrp_jax.bench.curve_rows import ROADMAP, Item, Setting, run_item
 from nrp_jax.bench.curve_stats import NOTES, REFERENCE, curves, grid_to, references
 from nrp_jax.bench.curve_table import to_text
 from nrp_jax.homes.houses import CELLS
-from nrp_jax.planner import PLANNERS
+from nrp_jax.planners.by_name import PLANNERS
 from nrp_jax.scene.robots import load_robot
 from vrrt_jax.core import command
 from vrrt_jax.core.peers import ompl_version
