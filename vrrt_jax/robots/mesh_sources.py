@@ -158,6 +158,7 @@ def inertial_spec(robot: "Robot") -> mujoco.MjSpec | None:
         tool = mjcf.read_inertial_spec(tool_path)
         mjcf.keep_torque_ranges(tool)
         mjcf.mount(spec, source.tool_site, tool, source.tool.root, fold=False)
+    mjcf.drop_shapes(spec)
     freeze_joints(spec, frozen_joints(robot))
     return spec
 

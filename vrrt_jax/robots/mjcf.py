@@ -186,6 +186,14 @@ def _fold(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:
         spec.delete(child)
 
 
+def drop_shapes(spec: mujoco.MjSpec) -> None:
+    """Delete, in place, the geoms of bodies whose masses do not come from them, and meshes."""
+    for body in spec.bodies:
+        for geom in list(body.geoms) if body.explicitinertial else []:
+            spec.delete(geom)
+    _delete_unused_meshes(spec)
+
+
 def keep_torque_ranges(spec: mujoco.MjSpec) -> None:
     """Give joints the torque ranges of their actuators, and delete all that acts, in place."""
     joints = {joint.name: joint for joint in spec.joints}
@@ -289,6 +297,10 @@ def strip_spec(spec: mujoco.MjSpec, *, visuals: bool) -> None:
             geom.material = ""
         for name in ("materials", "textures", "hfields"):
             _delete_all(spec, name)
+    _delete_unused_meshes(spec)
+
+
+def _delete_unused_meshes(spec: mujoco.MjSpec) -> None:
     used = {geom.meshname for geom in spec.geoms}
     for mesh in list(spec.meshes):
         if mesh.name not in used and Path(mesh.file).stem not in used:

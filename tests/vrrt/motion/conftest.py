@@ -28,8 +28,7 @@ GANTRY = """
 def gantry(tmp_path_factory):
     path = tmp_path_factory.mktemp("robots") / "gantry.xml"
     path.write_text(GANTRY)
-    with pytest.warns(UserWarning, match="never checked"):
-        return vrrt_jax.load_robot(path)
+    return vrrt_jax.load_robot(path)
 
 
 @pytest.fixture(scope="session")

@@ -67,8 +67,7 @@ def test_joints_that_wrap_take_the_shorter_direction(tmp_path, slow):
     file = tmp_path / "wheel.xml"
     body = '<body><joint name="w"/><geom size=".1" pos="1 0 0"/></body>'
     file.write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
-    with pytest.warns(UserWarning):
-        wheel = vrrt_jax.load_robot(file)
+    wheel = vrrt_jax.load_robot(file)
     timed = time_parameterize(wheel, np.array([[3.0], [-3.0]]), limits=slow)
     assert timed.positions[-1, 0] == pytest.approx(2 * np.pi - 3.0)
 
