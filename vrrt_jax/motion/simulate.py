@@ -100,6 +100,8 @@ def _model(robot: Robot) -> mujoco.MjModel:
         )
     spec.option.timestep = _STEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    # Strong damping makes accelerations of steps other ones than those of instants.
+    spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_INVDISCRETE
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     try:
         return spec.compile()
