@@ -29,6 +29,10 @@ from vrrt_jax.core.types import (  # noqa: E402
     pytree,
     static,
 )
+from vrrt_jax.motion.export import save_trajectory  # noqa: E402
+from vrrt_jax.motion.limits import MotionLimits, motion_limits  # noqa: E402
+from vrrt_jax.motion.simulate import Tracking, execute_in_sim  # noqa: E402
+from vrrt_jax.motion.trajectory import Trajectory, time_parameterize  # noqa: E402
 from vrrt_jax.planner import plan, plan_batch, plan_to_configuration  # noqa: E402
 from vrrt_jax.problems import Problem, load_problem, load_world, problem_names  # noqa: E402
 from vrrt_jax.robots import Robot, load_robot, robot_names  # noqa: E402
@@ -71,6 +75,7 @@ __all__ = [
     "LineageConfig",
     "MatchConfig",
     "MjxWorld",
+    "MotionLimits",
     "Obstacle",
     "PLANNERS",
     "PlanResult",
@@ -86,6 +91,8 @@ __all__ = [
     "Space",
     "SplatModel",
     "Status",
+    "Tracking",
+    "Trajectory",
     "Tree",
     "TreeConfig",
     "Verification",
@@ -97,6 +104,7 @@ __all__ = [
     "detach",
     "difference",
     "distance",
+    "execute_in_sim",
     "is_free",
     "link_poses",
     "load_problem",
@@ -105,6 +113,7 @@ __all__ = [
     "load_world",
     "look_at",
     "make_termination",
+    "motion_limits",
     "move_obstacle",
     "obstacle_clearance",
     "obstacle_list",
@@ -118,8 +127,10 @@ __all__ = [
     "render",
     "robot_names",
     "save_self_model",
+    "save_trajectory",
     "search",
     "static",
+    "time_parameterize",
     "verify_path",
     "with_obstacles",
     "write_image",

@@ -42,6 +42,12 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--paper", action="store_true", help="the published settings")
     plan.add_argument("--capacity", type=command.whole(8, 1 << 20), help="nodes of the tree")
     plan.add_argument("--out", default="out", help="folder for the results")
+    plan.add_argument(
+        "--trajectory", help="also write the path with its times: a .npz, .json, .csv or .yaml file"
+    )
+    plan.add_argument(
+        "--limits", help="a JSON file with the robot's velocity, acceleration and jerk limits"
+    )
     plan.add_argument("--no-pictures", action="store_true", help="no figure and no animation")
 
     render = commands.add_parser("render", help="make a goal image with MuJoCo's renderer")
@@ -124,6 +130,7 @@ def _plan(arguments: argparse.Namespace) -> int:
     config = make().changed(changes)
     check_config(config)
     problem, out = _problem(arguments), Path(arguments.out)
+    limits = _motion_limits(arguments, problem.robot)
     print(f"{problem.name}: {problem.robot.name}, seed {arguments.seed}; compiling ...", flush=True)
     with tqdm(total=config.budget.max_iterations, unit="it", disable=None, leave=False) as bar:
 
@@ -144,11 +151,30 @@ def _plan(arguments: argparse.Namespace) -> int:
     print(result)
     with command.or_printed(lambda: f"path: {json.dumps(result.path.tolist())}"):
         report.save_result(problem, result, config, arguments.seed, out)
+    if limits is not None and result.ok:
+        timed = vrrt_jax.time_parameterize(problem.robot, result, problem.world, limits=limits)
+        vrrt_jax.save_trajectory(timed, arguments.trajectory)
+        print(f"wrote {arguments.trajectory}: {timed.duration:.2f} s, {timed.stops} stops")
     if not arguments.no_pictures:
         _pictures(problem, result, out)
     if not result.ok:
         print(f"{result.status.name}: {result.status.value}; {result.advice}", file=sys.stderr)
     return EXIT_SOLVED if result.ok else EXIT_UNSOLVED
+
+
+def _motion_limits(arguments: argparse.Namespace, robot):
+    """Limits for ``--trajectory``, asked for before the plan; None without it."""
+    import vrrt_jax
+    from vrrt_jax import problems
+    from vrrt_jax.motion.export import checked_suffix
+
+    if arguments.trajectory is None:
+        if arguments.limits is not None:
+            raise ValueError("--limits is for --trajectory, which is not given; give both")
+        return None
+    checked_suffix(arguments.trajectory)
+    given = {} if arguments.limits is None else problems.read_json(arguments.limits)
+    return vrrt_jax.motion_limits(robot, vrrt_jax.MotionLimits.from_dict(given))
 
 
 def _pictures(problem, result, out: Path) -> None:
