@@ -1,4 +1,4 @@
-"""The ``nrp`` command: homes, data, train, score, plan, bench."""
+"""The ``nrp`` command: homes, data, train, score, plan, bench, report."""
 
 import argparse
 import json
@@ -17,7 +17,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from nrp_jax.bench import checks, planning, score
+    from nrp_jax.bench import checks, curves, planning, report, score
     from nrp_jax.homes import figure
     from nrp_jax.learning import data, train
 
@@ -25,12 +25,12 @@ def _parser() -> argparse.ArgumentParser:
         prog="nrp", description="Motion planning in homes, with learned samplers."
     )
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (figure, data, train, score):
+    for module in (figure, data, train, score, report):
         module.add_arguments(commands)
     _add_plan(commands)
     bench = commands.add_parser("bench", help="measure speed and success")
     benches = bench.add_subparsers(dest="what", required=True)
-    for module in (checks, planning):
+    for module in (checks, planning, curves):
         module.add_arguments(benches)
     return parser
 
@@ -47,7 +47,9 @@ def _add_plan(commands) -> None:
     plan.add_argument("--goal", type=command.numbers, help="as --goal=...")
     plan.add_argument(
         "--method",
-        help="rrt, rrt-is, rrt-connect, nrp-d, nrp-g, nrp-connect (default) or nrp-star-connect",
+        help="nrp-connect (default), rrt, rrt-is, rrt-connect, nrp-d or nrp-g; or, to shorten the "
+        "path until the budget ends, bit-star, rrt-star, irrt-star, nrp-star-d, nrp-star-g or "
+        "nrp-star-connect",
     )
     plan.add_argument("--model", help="what nrp train wrote; packaged weights by default")
     plan.add_argument("--crop", type=command.numbers, help="plan in x0,y0,x1,y1 of the map [m]")
@@ -69,7 +71,8 @@ def _add_plan(commands) -> None:
 def _plan(arguments: argparse.Namespace) -> int:
     import jax
 
-    from nrp_jax.planner import CONNECT, KINDS, plan
+    from nrp_jax.planner import plan
+    from nrp_jax.planners.by_name import CONNECT, KINDS
     from nrp_jax.planners.nrp_connect import UNCHECKED, default_planner
     from nrp_jax.samplers import load_sampler
     from nrp_jax.scene.world import build_world

@@ -9,17 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nrp_jax.config import EDGE_STEPS, PlannerConfig
+from nrp_jax.config import PlannerConfig
 from nrp_jax.homes.grid import Grid
-from nrp_jax.planners.nrp import NeuralRRT
-from nrp_jax.planners.nrp_connect import (
-    NRPConnect,
-    default_planner,
-    packaged_sampler,
-    search_connect,
-)
+from nrp_jax.planners.by_name import PLANNERS, policy_of
+from nrp_jax.planners.nrp_connect import NRPConnect, default_planner, search_connect
 from nrp_jax.planners.restarts import search_with_restarts
-from nrp_jax.samplers import check_fits, load_sampler
 from nrp_jax.scene.configurations import check_configuration
 from nrp_jax.scene.exact import ExactScene, verify
 from nrp_jax.scene.nearest import shifted, working_world
@@ -30,7 +24,6 @@ from vrrt_jax.core.check_protocols import check_extracted_path, check_policy
 from vrrt_jax.core.edges import nearest_turn
 from vrrt_jax.core.goal import ConfigurationGoal, starts_at
 from vrrt_jax.core.interrupt import interruptible
-from vrrt_jax.core.planners import RRT, RRTConnect
 from vrrt_jax.core.postprocess import CheckedPath, plan_result, postprocess, unchecked
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import STATUS_OF, PlanResult, Status
@@ -38,10 +31,6 @@ from vrrt_jax.core.search import SearchResult, make_termination, no_search, sear
 from vrrt_jax.core.settings import check_settings
 from vrrt_jax.core.types import ExpansionPolicy
 
-CONNECT = ("nrp-connect", "nrp-star-connect")
-PLANNERS = ("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g", *CONNECT)
-# Of the samplers that planners need.
-KINDS = {"nrp-d": "discriminator", "nrp-g": "cvae", **dict.fromkeys(CONNECT, "cvae")}
 ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
 ADVICE = {
     Status.SOLVED: "",
@@ -74,6 +63,10 @@ def plan(
 ) -> PlanResult:
     """Find a collision-free path between two configurations in a home.
 
+    Planners with "star" in their names improve their paths until ``max_expansions`` or
+    ``time_limit_s``, whichever ends first; column 4 of ``history`` is the length of the path over
+    time.
+
     Should the path that was found touch something between two of the planner's checks, it plans
     again with checks twice as fine, up to twice, with what is left of the budgets.
 
@@ -87,8 +80,8 @@ def plan(
             :class:`~vrrt_jax.core.types.ExpansionPolicy`. By default "nrp-connect" where the
             packaged networks fit robot and map, otherwise "rrt-connect".
         method: another word for ``planner``.
-        sampler: what proposes waypoints to "nrp-d", "nrp-g" and "nrp-connect": a pytree with
-            ``propose(world, q_from, q_goal, key)``; the packaged weights by default.
+        sampler: what proposes waypoints to the "nrp-" planners: a pytree with ``propose(world,
+            q_from, q_goal, key)``; the packaged weights by default.
         world: of this robot and grid, to save building it again; its ``is_free`` is obeyed.
         scene: the exact scene of this robot and grid, to save building it again.
         config: settings, the default ones if None.
@@ -111,12 +104,16 @@ def plan(
     places = _Places(corner=corner, start=q_start)
     start, goal_q = (jnp.asarray(shifted(q, -corner), jnp.float32) for q in (q_start, q_goal))
     goal = dataclasses.replace(goal, q=goal_q)
-    policy = _policy(planner, robot, world, sampler, config)
+    policy = policy_of(planner, robot, world, sampler, config)
     if config.capacity < policy.lanes + 2:
         raise ValueError(
             f"capacity is {config.capacity}; expected at least {policy.lanes + 2}, two more than "
             "the lanes: raise it or lower lanes"
         )
+    # Shorter paths keep closer to obstacles, and a planner that goes on until its budget ends has
+    # none left to plan again: its checks are twice as fine from the first.
+    if policy.goal_score(goal) == -np.inf:
+        world = dataclasses.replace(world, resolution=world.resolution / 2)
     tree = policy.init(world, goal, np.asarray(start)[None], config.capacity)
     scene = scene or ExactScene(robot, grid)
     if starts_at(goal, world, start):
@@ -229,36 +226,6 @@ def _config(config: PlannerConfig | None, settings: dict[str, Any]) -> PlannerCo
     config = dataclasses.replace(config, **settings)
     check_settings(config)
     return config
-
-
-def _policy(
-    planner: str | ExpansionPolicy,
-    robot: MobileRobot,
-    world: GridWorld,
-    sampler: Any,
-    config: PlannerConfig,
-) -> ExpansionPolicy:
-    """The policy of a planner by name, or the object itself.
-
-    Raises:
-        ValueError: the sampler does not fit.
-    """
-    if not isinstance(planner, str):
-        return planner
-    if planner == "rrt-connect":
-        return RRTConnect(lanes=max(config.lanes, 2))
-    bias = jnp.float32(config.goal_bias)
-    shape = {"keep_partial": True, "lanes": config.lanes, "edge_steps": EDGE_STEPS}
-    if planner in ("rrt", "rrt-is"):
-        return RRT(goal_bias=bias, intermediate=planner == "rrt-is", **shape)
-    if sampler is None and planner in CONNECT:
-        sampler = packaged_sampler(robot.name)
-    sampler = load_sampler(robot.name, KINDS[planner]) if sampler is None else sampler
-    check_fits(sampler, robot, world, KINDS[planner])
-    if planner in CONNECT:
-        return NRPConnect(sampler=sampler, lanes=max(config.lanes, 2))
-    rate = jnp.float32(config.straight_rate)
-    return NeuralRRT(goal_bias=bias, sampler=sampler, straight_rate=rate, **shape)
 
 
 def _finish(

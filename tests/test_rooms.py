@@ -12,6 +12,7 @@ VRRT_ROOMS = (
     ("core",),
     ("robots",),
     ("scene",),
+    ("motion",),
     ("splat",),
     ("config", "checks", "outcome"),
     ("visual",),

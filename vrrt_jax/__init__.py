@@ -29,6 +29,10 @@ from vrrt_jax.core.types import (  # noqa: E402
     pytree,
     static,
 )
+from vrrt_jax.motion.export import save_trajectory  # noqa: E402
+from vrrt_jax.motion.limits import MotionLimits, motion_limits  # noqa: E402
+from vrrt_jax.motion.simulate import Tracking, execute_in_sim  # noqa: E402
+from vrrt_jax.motion.trajectory import Trajectory, time_parameterize  # noqa: E402
 from vrrt_jax.planner import plan, plan_batch, plan_to_configuration  # noqa: E402
 from vrrt_jax.problems import Problem, load_problem, load_world, problem_names  # noqa: E402
 from vrrt_jax.robots import Robot, load_robot, robot_names  # noqa: E402
@@ -72,6 +76,7 @@ __all__ = [
     "LineageConfig",
     "MatchConfig",
     "MjxWorld",
+    "MotionLimits",
     "Obstacle",
     "PLANNERS",
     "PlanResult",
@@ -87,6 +92,8 @@ __all__ = [
     "Space",
     "SplatModel",
     "Status",
+    "Tracking",
+    "Trajectory",
     "Tree",
     "TreeConfig",
     "Verification",
@@ -98,6 +105,7 @@ __all__ = [
     "detach",
     "difference",
     "distance",
+    "execute_in_sim",
     "is_free",
     "link_poses",
     "load_problem",
@@ -106,6 +114,7 @@ __all__ = [
     "load_world",
     "look_at",
     "make_termination",
+    "motion_limits",
     "move_obstacle",
     "obstacle_clearance",
     "obstacle_list",
@@ -119,8 +128,10 @@ __all__ = [
     "render",
     "robot_names",
     "save_self_model",
+    "save_trajectory",
     "search",
     "static",
+    "time_parameterize",
     "verify_path",
     "view",
     "with_obstacles",

@@ -42,6 +42,12 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--paper", action="store_true", help="the published settings")
     plan.add_argument("--capacity", type=command.whole(8, 1 << 20), help="nodes of the tree")
     plan.add_argument("--out", default="out", help="folder for the results")
+    plan.add_argument(
+        "--trajectory", help="also write the path with its times: a .npz, .json, .csv or .yaml file"
+    )
+    plan.add_argument(
+        "--limits", help="a JSON file with the robot's velocity, acceleration and jerk limits"
+    )
     plan.add_argument("--no-pictures", action="store_true", help="no figure and no animation")
 
     view = commands.add_parser("view", help="show a plan in the browser")
@@ -76,12 +82,25 @@ def _parser() -> argparse.ArgumentParser:
     spheres.set_defaults(run=_spheres, out_is_file=True)
     add_robot(spheres)
     spheres.add_argument("--out", help="the MJCF file to write; only measured without it")
+    spheres.add_argument(
+        "--into",
+        help="an MJCF file that the command wrote: its joints and home stay, spheres are replaced",
+    )
     spheres.add_argument("--seed", type=command.seed, default=0, help="of fit and measurement")
+    spheres.add_argument(
+        "--spheres",
+        type=command.whole(1, 200),
+        default=44,
+        help="collision spheres to fit, on all moving links together",
+    )
     spheres.add_argument(
         "--num",
         type=command.whole(1, 10_000_000),
         default=10_000,
         help="configurations to measure on",
+    )
+    spheres.add_argument(
+        "--worlds", nargs="+", help="MJCF files to measure among; else random scenes"
     )
 
     bench = commands.add_parser("bench", help="measure speed, success or settings")
@@ -116,6 +135,7 @@ def _plan(arguments: argparse.Namespace) -> int:
     config = make().changed(changes)
     check_config(config)
     problem, out = _problem(arguments), Path(arguments.out)
+    limits = _motion_limits(arguments, problem.robot)
     print(f"{problem.name}: {problem.robot.name}, seed {arguments.seed}; compiling ...", flush=True)
     with tqdm(total=config.budget.max_iterations, unit="it", disable=None, leave=False) as bar:
 
@@ -136,6 +156,10 @@ def _plan(arguments: argparse.Namespace) -> int:
     print(result)
     with command.or_printed(lambda: f"path: {json.dumps(result.path.tolist())}"):
         report.save_result(problem, result, config, arguments.seed, out)
+    if limits is not None and result.ok:
+        timed = vrrt_jax.time_parameterize(problem.robot, result, problem.world, limits=limits)
+        vrrt_jax.save_trajectory(timed, arguments.trajectory)
+        print(f"wrote {arguments.trajectory}: {timed.duration:.2f} s, {timed.stops} stops")
     if not arguments.no_pictures:
         _pictures(problem, result, out)
     if not result.ok:
@@ -150,6 +174,21 @@ def _view(arguments: argparse.Namespace) -> int:
     print(f"{page.url} shows {arguments.folder}; Ctrl-C ends it", flush=True)
     page.serve()
     return EXIT_SOLVED
+
+
+def _motion_limits(arguments: argparse.Namespace, robot):
+    """Limits for ``--trajectory``, asked for before the plan; None without it."""
+    import vrrt_jax
+    from vrrt_jax import problems
+    from vrrt_jax.motion.export import checked_suffix
+
+    if arguments.trajectory is None:
+        if arguments.limits is not None:
+            raise ValueError("--limits is for --trajectory, which is not given; give both")
+        return None
+    checked_suffix(arguments.trajectory)
+    given = {} if arguments.limits is None else problems.read_json(arguments.limits)
+    return vrrt_jax.motion_limits(robot, vrrt_jax.MotionLimits.from_dict(given))
 
 
 def _pictures(problem, result, out: Path) -> None:
@@ -250,20 +289,29 @@ def _fit(arguments: argparse.Namespace) -> int:
 
 def _spheres(arguments: argparse.Namespace) -> int:
     from vrrt_jax.robots import load_robot
+    from vrrt_jax.robots.mjcf_writer import replace_spheres
     from vrrt_jax.robots.robot_fit import fit_spheres
+    from vrrt_jax.scene.obstacles import load_obstacles
     from vrrt_jax.scene.sphere_errors import measure_spheres
 
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
     if arguments.out is not None:
-        Path(arguments.out).write_text(fit_spheres(robot, seed=arguments.seed, progress=print))
+        text = fit_spheres(
+            robot, num_spheres=arguments.spheres, seed=arguments.seed, progress=print
+        )
+        if arguments.into is not None:
+            text = replace_spheres(Path(arguments.into).read_text(), text)
+        Path(arguments.out).write_text(text)
         print(f"wrote {arguments.out}")
         robot = load_robot(arguments.out)
-    measured = measure_spheres(robot, num=arguments.num, seed=arguments.seed)
+    scenes = [load_obstacles(path) for path in arguments.worlds or ()]
+    measured = measure_spheres(robot, arguments.num, arguments.seed, scenes)
     covering, thin = robot.collision_spheres.radius, robot.self_collision_spheres.radius
     print(f"{len(covering)} covering and {len(thin)} thin spheres")
     for name, counts in (
         ("against obstacles", measured.obstacles),
         ("against itself", measured.self_collision),
+        ("in one count", measured.either),
     ):
         print(
             f"{name}: {counts.misses} of {counts.colliding} collisions missed, "

@@ -79,9 +79,7 @@ def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
         self_model = None if self_model is None else _beside(folder, self_model, "self_model")
         true_goal = fields.get("true_goal")
         views = _checked_views(fields["views"], file)
-        images = tuple(
-            read_image(_beside(folder, view["image"], "image")) for view in views
-        )
+        images = tuple(read_image(_beside(folder, view["image"], "image")) for view in views)
         cameras = tuple(
             camera_from_dict(view["camera"], image.shape[:2])
             for view, image in zip(views, images, strict=True)

@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-import platform
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ from vrrt_jax.core.edges import joint_error
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.result import PlanResult
 from vrrt_jax.core.shortcut import path_length
+from vrrt_jax.core.timing import versions
 from vrrt_jax.core.tree_file import nodes_of, save_nodes
 from vrrt_jax.problems import Problem, save_problem
 from vrrt_jax.scene.world import World
@@ -68,13 +67,6 @@ def outcome(world: World, result: PlanResult) -> dict[str, Any]:
             "rejected": dict(result.rejected),
         },
     }
-
-
-def versions() -> dict[str, str]:
-    """Versions of what the result depends on."""
-    names = ("vrrt-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "optax", "numpy")
-    found = {name: metadata.version(name) for name in names}
-    return {"python": platform.python_version(), **found}
 
 
 def save_result(

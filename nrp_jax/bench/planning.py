@@ -13,7 +13,8 @@ import numpy as np
 from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning.difficulty import EXPANSIONS, MIN_GEODESIC, fair_house, long_queries
 from nrp_jax.learning.shards import DatasetSettings, home_seed
-from nrp_jax.planner import CONNECT, KINDS, PLANNERS, PlanResult, Status, plan
+from nrp_jax.planner import PlanResult, Status, plan
+from nrp_jax.planners.by_name import CONNECT, KINDS, PLANNERS
 from nrp_jax.planners.nrp_connect import UNCHECKED
 from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.robots import MobileRobot, load_robot

@@ -18,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax import samplers
+from nrp_jax.bench.maps import load_maps
 from nrp_jax.bench.optimality import make_queries, optimality
-from nrp_jax.homes.grid import Grid, load_map
+from nrp_jax.homes.grid import Grid
 from nrp_jax.learning.data import load_dataset
 from nrp_jax.learning.models import KINDS, TASKS
 from nrp_jax.learning.roadmap import Roadmap, build_roadmap, load_roadmap
@@ -207,19 +208,12 @@ def _load_maps(
     Raises:
         ValueError: no map fits.
     """
-    kinds = (".npz", ".yaml", ".yml", ".xml")
-    grids = {}
-    for file in sorted(file for file in folder.rglob("*") if file.suffix in kinds):
-        try:
-            grid = load_map(file)
-            grid = dataclasses.replace(grid, origin=(0.0, 0.0, grid.origin[2]))
-            world = build_world(robot, grid)
-            for kind, sampler in tested.items():
-                samplers.check_fits(sampler, robot, world, kind)
-        except ValueError as error:
-            print(f"map '{file}' is left out: {error}", file=sys.stderr)
-            continue
-        grids[file.relative_to(folder).as_posix()] = grid
-    if not grids:
-        raise ValueError(f"no maps for {robot.name} in '{folder}'; expected {', '.join(kinds)}")
-    return grids
+
+    def fit(grid: Grid) -> Grid:
+        grid = dataclasses.replace(grid, origin=(0.0, 0.0, grid.origin[2]))
+        world = build_world(robot, grid)
+        for kind, sampler in tested.items():
+            samplers.check_fits(sampler, robot, world, kind)
+        return grid
+
+    return load_maps(folder, robot.name, fit)

@@ -48,7 +48,7 @@ class NeuralRRT(RRT):
         return Proposals(
             parent=parent,
             target=jnp.where(straight[:, None], aim, waypoint),
-            valid=jnp.ones(self.lanes, bool),
+            valid=jnp.all(jnp.isfinite(aim), axis=1),
             partial=jnp.ones(self.lanes, bool),
             aux=WaypointLanes(aim=aim, straight=straight),
             checked=checked,
@@ -62,14 +62,17 @@ class NeuralRRT(RRT):
         proposals: Proposals,
         expansion: Expansion,
     ) -> Tree:
-        """Go on from the waypoints that were reached towards the aims."""
+        """Go on from the waypoints that were reached towards the aims.
+
+        What the planner below this one does with new nodes, it does with both.
+        """
         lanes: WaypointLanes = proposals.aux
-        tree = self.with_sub_steps(world, tree, proposals.parent, expansion.q, expansion.accepted)
+        tree = super().after_insert(world, goal, tree, proposals, expansion)
 
         # From every waypoint that was reached, as far towards the aim as the edge is free.
         onward = expansion.accepted & ~expansion.blocked & ~lanes.straight
         edge = world.steer(expansion.q, lanes.aim, self.edge_steps)
-        num_free, checked = free_prefix(world, expansion.q, edge, self.edge_steps)
+        num_free, checked = free_prefix(world, expansion.q, edge, self.edge_steps, tried=onward)
         tree = dataclasses.replace(tree, checked=tree.checked + checked)
         edge = world.truncate(edge, num_free / self.edge_steps)
         q, length = world.normalize(world.end(expansion.q, edge)), world.length(edge)
@@ -87,4 +90,11 @@ class NeuralRRT(RRT):
             payload=None,
             valid=moved,
         )
-        return self.with_sub_steps(world, tree, waypoint, q, node_index < tree.capacity)
+        proposals = dataclasses.replace(proposals, parent=waypoint)
+        expansion = Expansion(
+            q=q,
+            node_index=node_index,
+            accepted=node_index < tree.capacity,
+            blocked=num_free < self.edge_steps,
+        )
+        return super().after_insert(world, goal, tree, proposals, expansion)

@@ -29,6 +29,7 @@ class CarWorld(GridWorld):
 
     radius: jax.Array  # () smallest turning radius [m]
     node_block: ClassVar[int] = 1 << 20  # one shortlist for all nodes
+    first_arm: ClassVar[int] = 3
 
     def distance(self, q_a: jax.Array, q_b: jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`."""

@@ -1,6 +1,6 @@
 """A robot on a sliding base among the solid cells of a home: is this configuration free?"""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,8 @@ from nrp_jax.scene.field import DistanceField
 from nrp_jax.scene.link_shapes import LinkShapes, axes, gaps, segment_to_cylinder
 from nrp_jax.scene.near_cells import NearCells, touches
 from nrp_jax.scene.robots import PlanarBoxes
-from vrrt_jax.core.edges import StraightLineEdges, joint_steps
+from vrrt_jax.core.boxes import box_inside_limits, half_extents
+from vrrt_jax.core.edges import StraightLineEdges, difference, joint_steps
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import PytreeSubclasses, pytree, static
 from vrrt_jax.robots.kinematics import Chain, link_poses, place
@@ -57,6 +58,7 @@ class GridWorld(PytreeSubclasses, StraightLineEdges):
     arm_weight: jax.Array  # () meters that a radian of the arm counts for
     resolution: jax.Array  # () longest sub-step of any joint [m] or [rad]
     groups: tuple[int, ...] = static()  # sizes of groups of spheres, as many as ``near``
+    first_arm: ClassVar[int] = 2  # the first joint that is not the base's
 
     @single_precision
     def is_free(self, q: jax.Array) -> jax.Array:
@@ -116,6 +118,20 @@ class GridWorld(PytreeSubclasses, StraightLineEdges):
         edge = self.edge(q_from, inside)
         longest = num_steps * self.resolution
         return self.truncate(edge, jnp.minimum(1.0, longest / jnp.maximum(self.span(edge), 1e-9)))
+
+    def informed_box(
+        self, q_a: jax.Array, q_b: jax.Array, cost: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """See :class:`vrrt_jax.core.edges.Space`: what one of base and arm leaves to the other."""
+        step = difference(self, q_a, q_b)
+        base, arm = step[:2], step[self.first_arm :]
+        base_half = half_extents(base, cost - self.arm_weight * norm(arm))
+        # Joints that wrap keep their whole range: the others are an ellipsoid of their own.
+        fixed = jnp.where(self.is_continuous[self.first_arm :], 0.0, arm)
+        arm_half = half_extents(fixed, (cost - norm(base)) / self.arm_weight)
+        heading = jnp.full(self.first_arm - 2, jnp.inf)
+        half = jnp.concatenate([base_half, heading, arm_half])
+        return box_inside_limits(self, (q_a + q_b) / 2, half)
 
     def is_resolved(self, edge: jax.Array, num_steps: int | jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import nrp_jax
-from nrp_jax.planner import PLANNERS
+from nrp_jax.planners.by_name import PLANNERS
 from nrp_jax.scene.exact import ExactScene, verify
 
 KEY = jax.random.key(0)

@@ -38,7 +38,8 @@ def test_packaged_problems_are_solved(tmp_path):
         out = tmp_path / name
         # The default engine, which compiles for longer, is what the README's example runs with.
         fast = ["--engine", "closed_form"]
-        assert cli.main(["plan", "--problem", name, "--out", str(out), *fast]) == 0
+        timed = ["--trajectory", str(out / "trajectory.npz")]
+        assert cli.main(["plan", "--problem", name, "--out", str(out), *fast, *timed]) == 0
         result = json.loads((out / "result.json").read_text())
         assert result["status"] == "SOLVED" and result["verified"]
         assert set(result["timing"]) == {"compile_s", "search_s", "shortcut_s", "verify_s"}
@@ -46,6 +47,9 @@ def test_packaged_problems_are_solved(tmp_path):
         problem = vrrt_jax.load_problem(name)
         path = np.load(out / "path.npz")["path"]
         np.testing.assert_allclose(path[0], problem.q_start, atol=1e-5)
+        with np.load(out / "trajectory.npz") as trajectory:
+            np.testing.assert_allclose(trajectory["positions"][[0, -1]], path[[0, -1]], atol=1e-5)
+            assert 0.3 < trajectory["time"][-1] < 10
         obstacles = vrrt_jax.obstacle_list(problem.world)
         assert vrrt_jax.verify_path(problem.robot, obstacles, path, step=0.002).ok
         with Image.open(out / "figure.png") as figure:
@@ -56,6 +60,22 @@ def test_packaged_problems_are_solved(tmp_path):
             animation.seek(animation.n_frames - 1)
             moved = np.abs(np.asarray(animation.convert("RGB"), float) - first).max(axis=2) > 40
             assert moved.mean() > 0.003
+
+
+def test_limits_of_motion_are_asked_for_before_the_plan(tmp_path, capsys):
+    """Each with one line, and before anything is compiled."""
+    (tmp_path / "limits.json").write_text('{"speed": 1.0}')
+    command = ["plan", "--problem", PROBLEMS[0], "--out", tmp_path, "--engine", "closed_form"]
+    for options, told in (
+        (["--limits", tmp_path / "limits.json"], "--limits is for --trajectory"),
+        (["--trajectory", tmp_path / "a.bag"], "expected a name that ends with one of: .npz"),
+        (
+            ["--trajectory", tmp_path / "a.csv", "--limits", tmp_path / "limits.json"],
+            "expected some of velocity, acceleration, jerk",
+        ),
+    ):
+        code, error = bad(capsys, *command, *options)
+        assert code == 2 and told in error
 
 
 def test_without_a_solution_the_exit_code_is_one(tmp_path, capsys):

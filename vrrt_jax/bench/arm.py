@@ -12,11 +12,10 @@ from tqdm import tqdm
 from vrrt_jax.bench import arm_trials, ompl_peers
 from vrrt_jax.bench.arm_problems import ArmProblems, read_problems
 from vrrt_jax.bench.arm_trials import Refusal, Trial
-from vrrt_jax.bench.results_file import plain, resume, write
 from vrrt_jax.bench.runner import total_refused
 from vrrt_jax.config import PlannerConfig
-from vrrt_jax.core.timing import machine
-from vrrt_jax.report import versions
+from vrrt_jax.core.results_file import plain, resume, write
+from vrrt_jax.core.timing import machine, versions
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.world import World, build_world

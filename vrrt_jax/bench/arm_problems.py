@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vrrt_jax.bench.results_file import fingerprint
+from vrrt_jax.core.results_file import fingerprint
 from vrrt_jax.robots.mesh_sources import frozen_joints
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.obstacles import Obstacle, check_obstacle, floats

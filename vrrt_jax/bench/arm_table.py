@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
-from vrrt_jax.bench.tables import table
+from vrrt_jax.core.markdown import table
 
 HEADS = (
     "scene",

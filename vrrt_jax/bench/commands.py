@@ -217,9 +217,10 @@ def _arm(arguments: argparse.Namespace) -> int:
 def _levels(text: str) -> list[float | str]:
     """Distances, and the word random for any pairs."""
     words = [word.strip() for word in text.split(",")]
-    numbers = ",".join(word for word in words if word != "random")
-    distances = command.numbers(numbers).tolist() if numbers else []
-    return [*distances, *["random"] * ("random" in words)]
+    distances = [word for word in words if word != "random"]
+    if len(distances) == len(words):
+        return command.numbers(text).tolist()
+    return [*(command.numbers(",".join(distances)).tolist() if distances else []), "random"]
 
 
 def _joint_values(text: str) -> dict[str, float]:

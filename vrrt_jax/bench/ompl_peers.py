@@ -4,17 +4,15 @@ OMPL's wheel has no robots. Its states are checked here by C MuJoCo, with the ro
 """
 
 import copy
-import functools
-import importlib.util
 import time
 from collections.abc import Callable
-from importlib import metadata
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from vrrt_jax.bench.arm_trials import Trial
+from vrrt_jax.core.peers import load_ompl, ompl_version
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.verify import verify_path
@@ -32,10 +30,8 @@ def settings() -> dict[str, Any]:
     Raises:
         ModuleNotFoundError: OMPL is not installed; the message says how.
     """
-    if importlib.util.find_spec("ompl") is None:
-        raise ModuleNotFoundError("the peers need OMPL: pip install 'vrrt-jax[peers]'")
     return {
-        "ompl": metadata.version("ompl"),
+        "ompl": ompl_version(),
         "resolution_rad": RESOLUTION,
         "range_rad": RANGE,
         "time_limit_s": PEERS,
@@ -58,7 +54,7 @@ def solve(robot: Robot, trial: Trial, *, name: str, seed: int) -> dict[str, Any]
         check found the path free; ``found``, that OMPL has one. ``raw_cost`` is that before it was
         simplified. The exact check is no part of the times.
     """
-    ompl = _ompl(seed)
+    ompl = load_ompl(seed)
     setup = _setup(robot, trial, ompl)
     own = setup.getSpaceInformation()
     peer = getattr(ompl.geometric, name)(own)
@@ -134,15 +130,3 @@ def _checker(robot: Robot, trial: Trial) -> Callable[[Any], bool]:
         return data.ncon == 0 or bool(scene.attached and not scene.touching(data.qpos))
 
     return is_free
-
-
-@functools.cache
-def _ompl(seed: int) -> Any:
-    """The package, silent and seeded."""
-    import ompl.base  # pyright: ignore[reportMissingImports]
-    import ompl.geometric  # pyright: ignore[reportMissingImports]
-    import ompl.util  # pyright: ignore[reportMissingImports]
-
-    ompl.util.RNG.setSeed(seed + 1)  # zero would be a random one
-    ompl.util.setLogLevel(ompl.util.LogLevel.LOG_NONE)
-    return ompl

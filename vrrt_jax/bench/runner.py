@@ -1,10 +1,8 @@
 """Run many tasks: streamed to a file, resumed from it, over several processes."""
 
-import concurrent.futures
 import dataclasses
-import multiprocessing
-import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +11,13 @@ from tqdm import tqdm
 
 from vrrt_jax.bench.methods import CAUSES, solve
 from vrrt_jax.bench.problem_tasks import files_of, problem_task
-from vrrt_jax.bench.results_file import fingerprint, plain, resume, write
 from vrrt_jax.bench.tasks import Scenery, Task, bench_robot, make_task
 from vrrt_jax.config import PlannerConfig
-from vrrt_jax.core.command import end_with_parent
 from vrrt_jax.core.interrupt import uninterrupted
-from vrrt_jax.core.timing import machine
+from vrrt_jax.core.results_file import fingerprint, plain, resume, write
+from vrrt_jax.core.timing import machine, versions
+from vrrt_jax.core.workers import in_processes
 from vrrt_jax.problems import self_model_path
-from vrrt_jax.report import versions
 
 FORMAT = 4
 
@@ -104,7 +101,7 @@ def run(benchmark: Benchmark, file: str | Path | None, *, jobs: int = 1) -> dict
     ]
     with tqdm(total=len(todo), unit="task", disable=None) as bar:
         won = 0
-        for count, row in enumerate(_rows(benchmark, todo, jobs), 1):
+        for count, row in enumerate(in_processes(partial(_run_task, benchmark), todo, jobs), 1):
             results["tasks"].append(row)
             results.update(_summary(benchmark, results["tasks"]))
             if file is not None:
@@ -114,31 +111,6 @@ def run(benchmark: Benchmark, file: str | Path | None, *, jobs: int = 1) -> dict
             bar.update()
     results.update(_summary(benchmark, results["tasks"]))
     return results
-
-
-def _rows(benchmark: Benchmark, todo: Sequence[tuple], jobs: int) -> Iterator[dict[str, Any]]:
-    if jobs == 1:
-        for item in todo:
-            yield _run_task(benchmark, item)
-        return
-    context = multiprocessing.get_context("spawn")
-    cores = context.Queue()
-    available = sorted(os.sched_getaffinity(0))
-    for worker in range(jobs):
-        cores.put(available[worker % len(available) :: jobs] or available)
-    pool = concurrent.futures.ProcessPoolExecutor(jobs, context, _pin, (cores,))
-    try:
-        pending = [pool.submit(_run_task, benchmark, item) for item in todo]
-        for finished in concurrent.futures.as_completed(pending):
-            yield finished.result()
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _pin(cores: Any) -> None:
-    """Give a worker cores of its own, or several would fight for all of them."""
-    end_with_parent()
-    os.sched_setaffinity(0, cores.get())
 
 
 def _run_task(benchmark: Benchmark, item: tuple[str, float | str, int]) -> dict[str, Any]:
@@ -166,11 +138,8 @@ def _key(row: dict[str, Any]) -> tuple[str, float | str, int]:
 
 def _fingerprints(folder: str, robot: str) -> dict[str, str]:
     """Of the files of problems, by name; {} without a folder."""
-    return (
-        {name: fingerprint(file) for name, file in files_of(folder, robot).items()}
-        if folder
-        else {}
-    )
+    files = files_of(folder, robot) if folder else {}
+    return {name: fingerprint(file) for name, file in files.items()}
 
 
 def _fresh(benchmark: Benchmark, jobs: int) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from vrrt_jax.bench.methods import CAUSES, METHODS
 from vrrt_jax.bench.tasks import ROBOTS
+from vrrt_jax.core.markdown import table
 
 # Average success over the five levels [%]; Visual-RRT (CVPR 2026), on an RTX 4090.
 PAPER = {
@@ -303,9 +304,3 @@ def _level(level: dict[str, Any]) -> str:
 
 def _percent(share: float | None) -> str:
     return "" if share is None else f"{100 * share:.1f}"
-
-
-def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

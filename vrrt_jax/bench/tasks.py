@@ -216,7 +216,7 @@ def goal_images(
     standing = tuple(o for o in obstacle_list(world) if o.kind != "plane")
     hiding = standing if scenery.occluded else ()
     renderer = _renderer(robot_name, hiding, scenery.light == SIDE)
-    rng = np.random.default_rng([task.index, zlib.crc32(f"{task.level:.3f}".encode())])
+    rng = np.random.default_rng([task.index, zlib.crc32(level_name(task.level).encode())])
     images, masks = [], []
     for camera in cameras(robot_name, scenery):
         picture = renderer.picture(task.q_goal, camera)

@@ -111,13 +111,14 @@ def in_one_line(error: Exception) -> str:
 def _check_outputs(arguments: argparse.Namespace) -> None:
     """Check, before any work, that what a command writes can be written.
 
-    ``--json`` and ``--figure`` name files. ``--out`` does where the parser says ``out_is_file``.
+    ``--json``, ``--figure`` and ``--trajectory`` name files. ``--out`` does where the parser says
+    ``out_is_file``.
 
     Raises:
         OSError: names the place that cannot be written.
     """
-    files = ["json", "figure"] + ["out"] * getattr(arguments, "out_is_file", False)
-    for name in ("out", "json", "figure"):
+    files = ["json", "figure", "trajectory"] + ["out"] * getattr(arguments, "out_is_file", False)
+    for name in ("out", "json", "figure", "trajectory"):
         place, option = getattr(arguments, name, None), f"--{name}"
         if place is None:
             continue

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.boxes import box_inside_limits, half_extents
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import pytree
 
@@ -96,6 +97,12 @@ class Space(Protocol):
         """The same configuration, wrapping joints in [-pi, pi)."""
         ...
 
+    def informed_box(
+        self, q_a: jax.Array, q_b: jax.Array, cost: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Bounds (D,) and (D,) of all ``q`` whose distances to two others sum up to ``cost``."""
+        ...
+
 
 class StraightLineEdges:
     """Straight edges, the short way round for joints that wrap; the edge is the step (..., D).
@@ -160,6 +167,13 @@ class StraightLineEdges:
     def normalize(self, q: jax.Array) -> jax.Array:
         """See :class:`Space`."""
         return normalize(self, q)
+
+    def informed_box(
+        self, q_a: jax.Array, q_b: jax.Array, cost: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """See :class:`Space`; joints that wrap keep their whole range."""
+        half = half_extents(jnp.where(self.is_continuous, 0.0, q_b - q_a), cost)
+        return box_inside_limits(self, (q_a + q_b) / 2, half)
 
 
 def joint_steps(space: StraightLineEdges, nodes: jax.Array, q: jax.Array, joint: int) -> jax.Array:
@@ -250,7 +264,12 @@ def num_checks(world: Space, max_step: float) -> int:
 
 
 def free_prefix(
-    world: Space, q_from: jax.Array, edge: Edge, num_steps: int
+    world: Space,
+    q_from: jax.Array,
+    edge: Edge,
+    num_steps: int,
+    tried: jax.Array | bool = True,
+    partial: jax.Array | bool = True,
 ) -> tuple[jax.Array, jax.Array]:
     """How far one can go along edges before something is touched.
 
@@ -259,25 +278,33 @@ def free_prefix(
         q_from: (B, D) starts, taken to be free.
         edge: of B lanes.
         num_steps: S sub-steps along each edge, checked at their far ends.
+        tried: (B,) bool, which edges count; the others are not checked.
+        partial: (B,) bool, of which the free part matters. Of the others only whether they are free
+            is asked: if they are not, the number is some number below S.
 
     Returns:
         (B,) i32 number of leading sub-steps that are free, S where the whole edge is; and () i32
         how many configurations were checked for that.
     """
-    checks = _check(world, q_from, edge, num_steps, lambda checks, step: step < checks.first)
+    tried, partial = (jnp.reshape(mask, (-1, 1)) for mask in (tried, partial))
+
+    def matters(checks: _Checks, step: jax.Array) -> jax.Array:
+        return tried & (step < jnp.where(partial | (checks.first == num_steps), checks.first, 0))
+
+    checks = _check(world, q_from, edge, num_steps, matters)
     return checks.first[:, 0], checks.checked
 
 
 def is_edge_free(
-    world: Space, q_from: jax.Array, edge: Edge, num_steps: int
+    world: Space, q_from: jax.Array, edge: Edge, num_steps: int, tried: jax.Array | bool = True
 ) -> tuple[jax.Array, jax.Array]:
     """Whether (B,) nothing is touched along whole edges, and () i32 how many checks that took.
 
-    An edge costs nothing more once something is found on it. See :func:`free_prefix`.
+    An edge costs nothing more once something is found on it, and nothing at all if it is not
+    ``tried`` (B,). See :func:`free_prefix`.
     """
-    whole = num_steps
-    checks = _check(world, q_from, edge, whole, lambda checks, step: checks.first == whole)
-    return checks.first[:, 0] == whole, checks.checked
+    num_free, checked = free_prefix(world, q_from, edge, num_steps, tried, partial=False)
+    return (num_free == num_steps) & tried, checked
 
 
 def first_free_edge(

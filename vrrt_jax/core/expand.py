@@ -35,7 +35,9 @@ def expand(
     edge = world.steer(q_from, proposals.target, policy.edge_steps)
 
     # Check edges: how many leading sub-steps are free. A blocked edge is cut there, or given up.
-    num_free, checked = free_prefix(world, q_from, edge, policy.edge_steps)
+    num_free, checked = free_prefix(
+        world, q_from, edge, policy.edge_steps, proposals.valid, proposals.partial
+    )
     free = (num_free == policy.edge_steps) | (proposals.partial & (num_free > 0))
     edge = world.truncate(edge, num_free / policy.edge_steps)
     length = world.length(edge)

@@ -27,72 +27,121 @@ def rewire(
     radius: jax.Array,
     edge_steps: int,
     checks: int,
+    neighbors: int | None = None,
+    tries: int = 1,
+    ancestors: int = 0,
 ) -> Tree[Payload]:
     """Rewire a tree around the nodes that an iteration inserted.
 
-    Every new node may ask for the edge from its best possible parent, and then for the edge to the
-    node that would gain most from it. Of either kind, the ``checks`` that save most are checked for
-    collision, which bounds the cost of an iteration.
+    Every new node may ask for the edges from its best possible parents, and then for the edges to
+    the nodes that would gain most from it. Of either kind, the ``checks`` that save most are
+    checked for collision, which bounds the cost of an iteration.
 
     Args:
         world: robot and obstacles.
-        tree: the tree, with the new nodes in it.
+        tree: the tree, with the new nodes in it; none of them has children.
         expansion: the new nodes.
-        radius: of the neighborhood [rad]; no more than ``edge_steps`` times the resolution.
+        radius: of the neighborhood, in the world's metric; no more than ``edge_steps`` times the
+            resolution.
         edge_steps: sub-steps of an edge check (static).
         checks: edges of either kind that are checked (static).
+        neighbors: so many nearest nodes are the neighborhood; all inside ``radius`` if None
+            (static).
+        tries: edges of either kind that a node asks for (static).
+        ancestors: of a new node's parent, so many may become its parent, however far they are
+            (static).
 
     Returns:
         The tree with new parents, and costs that are right for all nodes.
     """
-    # Which old nodes (B, N) are near which new ones. Rejected lanes stand in at node 0.
+    # Old nodes (B, K) near the new ones, and how far; +inf where they are not. Rejected lanes stand
+    # in at node 0. The barrier keeps XLA from computing the distances once for every use.
     radius = jnp.minimum(radius, edge_steps * world.resolution)
-    distances = trees.distances(world, tree, expansion.q)
+    apart = jax.lax.optimization_barrier(trees.distances(world, tree, expansion.q))
     is_old = jnp.arange(tree.capacity) < tree.size - jnp.sum(expansion.accepted)
-    near = expansion.accepted[:, None] & is_old & (distances < radius)
+    apart = jnp.where(expansion.accepted[:, None] & is_old & (apart < radius), apart, jnp.inf)
+    old = jnp.broadcast_to(jnp.arange(tree.capacity), apart.shape)
+    if neighbors is not None:
+        nearness, old = jax.lax.top_k(-apart, neighbors)
+        apart = -nearness
     new = jnp.where(expansion.accepted, expansion.node_index, 0)
 
-    # Choose parents: the old node through which a new one costs least, if the edge is free.
-    # Writes to slot N are dropped: that is how lanes without a better parent write nothing.
-    cost_through_old = jnp.where(near, tree.cost + distances, jnp.inf)
-    best, cost_via = jnp.argmin(cost_through_old, axis=1), jnp.min(cost_through_old, axis=1)
-    lane, better = _largest(tree.cost[new] - cost_via, checks)
-    free, checked_parents = _edge_is_free(world, tree.q[best[lane]], expansion.q[lane], edge_steps)
-    better &= free
-    slot = jnp.where(better, expansion.node_index[lane], tree.capacity)
-    parent = tree.parent.at[slot].set(best[lane].astype(jnp.int32), mode="drop")
-    cost = tree.cost.at[slot].set(cost_via[lane], mode="drop")
+    # Choose parents: what a new node (B, tries) would save with another one, for the free edges.
+    saving, choice = jax.lax.top_k(tree.cost[new][:, None] - tree.cost[old] - apart, tries)
+    better = jnp.take_along_axis(old, choice, axis=1)
+    if ancestors:
+        saving_up, up = _ancestors(world, tree, expansion, new, ancestors)
+        saving, better = (
+            jnp.concatenate(pair, axis=1) for pair in ((saving, saving_up), (better, up))
+        )
+    q_new = jnp.broadcast_to(expansion.q[:, None], (*better.shape, expansion.q.shape[1]))
+    free, checked_parents = _free_gains(world, saving, tree.q[better], q_new, edge_steps, checks)
+    # The free edge that saves most. Writes to slot N are dropped: lanes without one write nothing.
+    free_saving = jnp.where(free, saving, 0.0)
+    best, most = jnp.argmax(free_saving, axis=1), jnp.max(free_saving, axis=1)
+    slot = jnp.where(most > 0, expansion.node_index, tree.capacity)
+    chosen = jnp.take_along_axis(better, best[:, None], axis=1)[:, 0]
+    parent = tree.parent.at[slot].set(chosen.astype(jnp.int32), mode="drop")
+    cost = tree.cost.at[slot].add(-most, mode="drop")
 
-    # Rewire: the old node that gains most from each new one. The main root keeps its place.
-    cost_through_new = jnp.where(near, cost[new][:, None] + distances, jnp.inf)
-    is_main_root = jnp.arange(tree.capacity) == 0
-    gain = jnp.where(is_main_root, -jnp.inf, cost - cost_through_new)
-    child, most = jnp.argmax(gain, axis=1), jnp.max(gain, axis=1)
-
-    # Two new nodes may want the same child: the one that offers more gets it, or the first.
-    same_child = child[:, None] == child
-    rival = (most[None] > most[:, None]) | (
-        (most[None] == most[:, None]) & (jnp.arange(len(new)) < jnp.arange(len(new))[:, None])
+    # Rewire: the old nodes that gain most from each new one. The main root keeps its place.
+    gain = jnp.where(old > 0, cost[old] - cost[new][:, None] - apart, -jnp.inf)
+    gain, choice = jax.lax.top_k(gain, tries)
+    child = jnp.take_along_axis(old, choice, axis=1)
+    free, checked_children = _free_gains(
+        world, gain, q_new[:, :tries], tree.q[child], edge_steps, checks
     )
-    lane, adopts = _largest(jnp.where(jnp.any(same_child & rival, axis=1), 0.0, most), checks)
-    free, checked_children = _edge_is_free(
-        world, expansion.q[lane], tree.q[child[lane]], edge_steps
-    )
-    adopts &= free
-    parent = parent.at[jnp.where(adopts, child[lane], tree.capacity)].set(
-        new[lane].astype(jnp.int32), mode="drop"
+    wins = winners(child.reshape(-1), jnp.where(free, gain, 0.0).reshape(-1), tree.capacity)
+    parent = parent.at[jnp.where(wins, child.reshape(-1), tree.capacity)].set(
+        jnp.repeat(new, tries).astype(jnp.int32), mode="drop"
     )
 
     # An adopted node passes its gain on to its whole subtree.
     checked = tree.checked + checked_parents + checked_children
     tree = dataclasses.replace(tree, parent=parent, cost=cost, checked=checked)
-    return jax.lax.cond(jnp.any(adopts), lambda t: with_costs(world, t), lambda t: t, tree)
+    return jax.lax.cond(jnp.any(wins), lambda t: with_costs(world, t), lambda t: t, tree)
 
 
-def _largest(gain: jax.Array, num: int) -> tuple[jax.Array, jax.Array]:
-    """Lanes (num,) that gain most, and whether that is more than nothing."""
-    gain, lane = jax.lax.top_k(gain, min(num, len(gain)))
-    return lane, gain > GAIN
+def winners(node: jax.Array, gain: jax.Array, capacity: int) -> jax.Array:
+    """Which (m,) of several offers to nodes (m,) are taken: the one that gains most, or the first.
+
+    Args:
+        node: (m,) i32.
+        gain: (m,) not positive where there is no offer.
+        capacity: N, of the tree.
+    """
+    most = jnp.zeros(capacity, gain.dtype).at[node].max(gain)
+    is_best = (gain > 0) & (gain >= most[node])
+    index = jnp.arange(len(node))
+    first = jnp.full(capacity, len(node)).at[node].min(jnp.where(is_best, index, len(node)))
+    return is_best & (first[node] == index)
+
+
+def _ancestors(
+    world: Space, tree: Tree, expansion: Expansion, new: jax.Array, num: int
+) -> tuple[jax.Array, jax.Array]:
+    """What new nodes (B, num) would save as children of their parents' ancestors, and these."""
+    chain, up = [], tree.parent[new]
+    for _ in range(num):
+        up = jnp.where(up >= 0, tree.parent[up], -1)
+        chain.append(up)
+    up = jnp.stack(chain, axis=1)
+    ahead = world.distance(tree.q[up], expansion.q[:, None])
+    saving = tree.cost[new][:, None] - tree.cost[up] - ahead
+    return jnp.where(expansion.accepted[:, None] & (up >= 0), saving, -jnp.inf), up
+
+
+def _free_gains(
+    world: Space, gain: jax.Array, q_from: jax.Array, q_to: jax.Array, steps: int, checks: int
+) -> tuple[jax.Array, jax.Array]:
+    """Which edges (B, K) are worth it and free, of the ``checks`` that gain most; and checks."""
+    flat = gain.reshape(-1)
+    most, index = jax.lax.top_k(flat, min(checks, len(flat)))
+    q_from, q_to = (q.reshape(len(flat), -1)[index] for q in (q_from, q_to))
+    edge = world.edge(q_from, q_to)
+    tried = (most > GAIN) & world.is_resolved(edge, steps)
+    free, checked = is_edge_free(world, q_from, edge, steps, tried)
+    return jnp.zeros(len(flat), bool).at[index].set(free).reshape(gain.shape), checked
 
 
 def with_costs(world: Space, tree: Tree[Payload]) -> Tree[Payload]:
@@ -101,14 +150,8 @@ def with_costs(world: Space, tree: Tree[Payload]) -> Tree[Payload]:
     ancestor = jnp.where(has_parent, tree.parent, jnp.arange(tree.capacity))
     length = jnp.where(has_parent, distance(world, tree.q[ancestor], tree.q), 0.0)
     # After k rounds every node knows its ancestor 2^k generations up, and the length to there.
-    for _ in range(max(tree.capacity - 1, 1).bit_length()):
-        length, ancestor = length + length[ancestor], ancestor[ancestor]
+    rounds = max(tree.capacity - 1, 1).bit_length()
+    length, ancestor = jax.lax.fori_loop(
+        0, rounds, lambda _, way: (way[0] + way[0][way[1]], way[1][way[1]]), (length, ancestor)
+    )
     return dataclasses.replace(tree, cost=tree.cost[ancestor] + length)
-
-
-def _edge_is_free(
-    world: Space, q_from: jax.Array, q_to: jax.Array, steps: int
-) -> tuple[jax.Array, jax.Array]:
-    edge = world.edge(q_from, q_to)
-    free, checked = is_edge_free(world, q_from, edge, steps)
-    return world.is_resolved(edge, steps) & free, checked

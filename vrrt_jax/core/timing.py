@@ -1,8 +1,9 @@
-"""Timing on a machine that others use too: the best of many, everything in one process."""
+"""Timing on a machine that others use too, and what a report tells of that machine."""
 
 import platform
 import time
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,13 @@ def machine() -> dict[str, str | int]:
         "platform": platform.platform(),
         "device": str(jax.devices()[0]),
     }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on."""
+    names = ("vrrt-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "optax", "numpy")
+    found = {name: metadata.version(name) for name in names}
+    return {"python": platform.python_version(), **found}
 
 
 def _processor() -> str:

@@ -195,7 +195,7 @@ def joined(grown: Sequence[Tree[Payload]], roots: int) -> Tree[Payload]:
     begin = roots + np.cumsum([0, *more[:-1]])  # where those of each tree go
     capacity = first.capacity * len(grown)
 
-    def joined_column(*columns: jax.Array, fill: Any = 0) -> jax.Array:
+    def joined_column(*columns: Array, fill: Any = 0) -> jax.Array:
         rows = [np.asarray(columns[0])[:roots]]
         rows += [
             np.asarray(column)[roots:size] for column, size in zip(columns, sizes, strict=True)

@@ -128,6 +128,41 @@ def mesh_spec(robot: "Robot", *, visuals: bool = True) -> mujoco.MjSpec | None:
     return spec
 
 
+def inertial_spec(robot: "Robot") -> mujoco.MjSpec | None:
+    """The robot with its true masses, rotor inertias and damping, and the planned joints only.
+
+    The largest torque of a joint is in its ``actfrcrange``, where the file has one for the joint
+    or for an actuator of it. Bodies without masses in the file have those that MuJoCo infers from
+    their shapes. Nothing else of the file is kept: no actuators, no contacts.
+
+    Args:
+        robot: from :func:`vrrt_jax.robots.load_robot`.
+
+    Returns:
+        A spec to edit and compile, new on every call; None if the file is nowhere on this machine.
+
+    Raises:
+        ValueError: the file found is unreadable.
+    """
+    path, source = mesh_file(robot.mesh_source), _SOURCES.get(str(robot.mesh_source))
+    if path is None:
+        return None
+    spec = mjcf.read_inertial_spec(path)
+    mjcf.keep_torque_ranges(spec)
+    if source and source.root:
+        mjcf.keep_body(spec, source.root)
+    if source and source.tool and source.tool.root:
+        tool_path = tool_file(robot.mesh_source)
+        if tool_path is None:
+            return None
+        tool = mjcf.read_inertial_spec(tool_path)
+        mjcf.keep_torque_ranges(tool)
+        mjcf.mount(spec, source.tool_site, tool, source.tool.root, fold=False)
+    mjcf.drop_shapes(spec)
+    freeze_joints(spec, frozen_joints(robot))
+    return spec
+
+
 def mesh_file(mesh_source: str | None) -> Path | None:
     """The file with the true geometry of a robot.
 

@@ -16,7 +16,7 @@ _SEEN, _HIDDEN = 1, 3  # groups of geoms: drawn, and not
 
 
 def read_spec(path: Path, *, visuals: bool = False) -> mujoco.MjSpec:
-    """Parse an MJCF or URDF file into an editable spec.
+    """Parse an MJCF or URDF file into an editable spec, for kinematics: all masses are the same.
 
     Args:
         path: an existing file.
@@ -47,6 +47,22 @@ def read_spec(path: Path, *, visuals: bool = False) -> mujoco.MjSpec:
         raise ValueError(_unreadable(path, error)) from None
 
 
+def read_inertial_spec(path: Path) -> mujoco.MjSpec:
+    """Parse an MJCF or URDF file into an editable spec, with the masses that it gives.
+
+    Raises:
+        ValueError: the file is not readable as a robot.
+    """
+    path = Path(path)
+    try:
+        root = urdf.urdf_root(path)
+        if root is None:
+            return _named(mujoco.MjSpec.from_file(str(path)))
+        return _named(urdf.urdf_spec(root, path, visuals=False))
+    except ValueError as error:
+        raise ValueError(_unreadable(path, error)) from None
+
+
 def _with_visuals(root: ElementTree.Element, path: Path) -> mujoco.MjSpec:
     """A URDF with the geoms that are for the eye; what collides is hidden where there are some."""
     spec = _plain(urdf.urdf_spec(root, path, visuals=True))
@@ -62,8 +78,8 @@ def _collides(geom: mujoco.MjsGeom) -> bool:
     return bool(geom.contype or geom.conaffinity)
 
 
-def _plain(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """The same with all bodies and joints named, and fit to compile for kinematics."""
+def _named(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """The same with all bodies and joints named."""
     spec.option.disableflags = 0  # a file may switch contacts off
     # A URDF fuses links without a joint of their own into their parents: their names would be lost.
     spec.compiler.fusestatic = False
@@ -71,6 +87,12 @@ def _plain(spec: mujoco.MjSpec) -> mujoco.MjSpec:
         taken = {element.name for element in elements}
         for index, element in enumerate(elements):
             element.name = element.name or free_name(f"{kind}_{index}", taken)
+    return spec
+
+
+def _plain(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """The same with all bodies and joints named, and fit to compile for kinematics."""
+    _named(spec)
     # Only kinematics is used; a URDF link without <inertial> would not compile.
     for body in spec.bodies[1:]:
         body.explicitinertial = True
@@ -111,10 +133,19 @@ def keep_body(spec: mujoco.MjSpec, name: str) -> None:
     body.pos, body.quat = [0, 0, 0], [1, 0, 0, 0]
 
 
-def mount(spec: mujoco.MjSpec, site: str, tool: mujoco.MjSpec, name: str) -> None:
+def mount(
+    spec: mujoco.MjSpec, site: str, tool: mujoco.MjSpec, name: str, *, fold: bool = True
+) -> None:
     """Put the body ``name`` of another model on a site, in place, rigid and in its rest position.
 
-    All that hangs on it becomes a part of it; names get the prefix ``tool_``.
+    Names get the prefix ``tool_``.
+
+    Args:
+        spec: what gets the tool.
+        site: of the spec.
+        tool: the other model.
+        name: of its body.
+        fold: all that hangs on the body becomes a part of it, but for masses.
 
     Raises:
         ValueError: there is no such site or body.
@@ -125,7 +156,10 @@ def mount(spec: mujoco.MjSpec, site: str, tool: mujoco.MjSpec, name: str) -> Non
             f"cannot mount body '{name}' at site '{site}': "
             f"{'the robot has no such site' if where is None else 'the tool has no such body'}"
         )
-    _fold(tool, body)
+    if fold:
+        _fold(tool, body)
+    else:
+        _delete_all(tool, "joints")
     mounted = where.attach_body(body, _TOOL, "")
     mounted.pos, mounted.quat = [0, 0, 0.007], [1, 0, 0, -1]  # the thickness of the coupling
 
@@ -150,6 +184,27 @@ def _fold(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:
                 quat=quaternion,
             )
         spec.delete(child)
+
+
+def drop_shapes(spec: mujoco.MjSpec) -> None:
+    """Delete, in place, the geoms of bodies whose masses do not come from them, and meshes."""
+    for body in spec.bodies:
+        for geom in list(body.geoms) if body.explicitinertial else []:
+            spec.delete(geom)
+    _delete_unused_meshes(spec)
+
+
+def keep_torque_ranges(spec: mujoco.MjSpec) -> None:
+    """Give joints the torque ranges of their actuators, and delete all that acts, in place."""
+    joints = {joint.name: joint for joint in spec.joints}
+    for actuator in spec.actuators:
+        low, high = actuator.forcerange
+        is_of_joint = actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.target in joints
+        if is_of_joint and low < high:
+            ends = actuator.gear[0] * low, actuator.gear[0] * high
+            joints[actuator.target].actfrcrange = sorted(ends)
+    for name in ("tuples", "sensors", "actuators", "tendons", "pairs", "excludes", "equalities"):
+        _delete_all(spec, name)
 
 
 def collide_visuals(spec: mujoco.MjSpec) -> None:
@@ -242,6 +297,10 @@ def strip_spec(spec: mujoco.MjSpec, *, visuals: bool) -> None:
             geom.material = ""
         for name in ("materials", "textures", "hfields"):
             _delete_all(spec, name)
+    _delete_unused_meshes(spec)
+
+
+def _delete_unused_meshes(spec: mujoco.MjSpec) -> None:
     used = {geom.meshname for geom in spec.geoms}
     for mesh in list(spec.meshes):
         if mesh.name not in used and Path(mesh.file).stem not in used:

@@ -79,6 +79,44 @@ def collision_mjcf(
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
+def replace_spheres(text: str, fitted: str) -> str:
+    """A written model with the spheres and the ignored pairs of another one.
+
+    What was added to the first by hand stays: joints, positions at home, custom numbers.
+
+    Args:
+        text: the model, from :func:`collision_mjcf`.
+        fitted: the other one, whose bodies have the same names.
+
+    Raises:
+        ValueError: the bodies have other names.
+    """
+    root, other = (
+        ET.fromstring(model, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
+        for model in (text, fitted)
+    )
+    bodies, others = (
+        {body.get("name"): body for body in tree.iter() if body.tag in ("worldbody", "body")}
+        for tree in (root, other)
+    )
+    if bodies.keys() != others.keys():
+        names = ", ".join(sorted(str(name) for name in bodies.keys() ^ others.keys()))
+        raise ValueError(f"bodies of one model only: {names}; expected the same in both")
+    for name, body in bodies.items():
+        for geom in body.findall("geom"):
+            body.remove(geom)
+        # Spheres stand behind the joints, before further bodies.
+        place = len(body.findall("joint"))
+        for geom in reversed(others[name].findall("geom")):
+            body.insert(place, geom)
+    # The comment says where the spheres come from.
+    for tag in (ET.Comment, "contact"):
+        place = next(k for k, part in enumerate(root) if part.tag == tag)
+        root[place] = next(part for part in other if part.tag == tag)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode") + "\n"
+
+
 def source_of(spec: mujoco.MjSpec) -> tuple[str | None, dict[str, float]]:
     """The ``mesh_source`` and ``frozen`` that :func:`collision_mjcf` kept, else None and {}."""
     sources = [element.data for element in spec.texts if element.name == _SOURCE]

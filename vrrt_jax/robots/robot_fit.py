@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Callable
 
+import mujoco
 import numpy as np
 
 from vrrt_jax.robots import mjcf_writer, sphere_fit
@@ -11,31 +12,37 @@ from vrrt_jax.robots.geom_pieces import collision_pieces
 from vrrt_jax.robots.kinematics import BodySpheres
 from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.robots.self_collision import find_ignored_pairs, sample_self_collisions
-from vrrt_jax.robots.self_collision_radii import fit_radii
+from vrrt_jax.robots.self_collision import (
+    SelfCollisions,
+    checked_pairs,
+    find_ignored_pairs,
+    sample_self_collisions,
+)
+from vrrt_jax.robots.self_collision_fit import fit_to_sample
 
-_CONFIGURATIONS = 100_000  # for self-collision
+_CONFIGURATIONS = 40_000  # for self-collision
 _LEAF = 3e-4  # [m] size of the smallest triangle when the cover is proven
+_PROBE = 3  # spheres with which the bodies are compared
+_SELF_SPACING = 0.05  # [m] of the longest side of a body, for each self-collision sphere
+_MOST_SELF = 12  # self-collision spheres of one body
 
 
 def fit_spheres(
     robot: Robot,
     *,
-    num_spheres: int = 32,
-    num_base_spheres: int = 4,
+    num_spheres: int = 44,
     seed: int = 0,
     progress: Callable[[str], None] = lambda line: None,
 ) -> str:
     """Fit spheres anew; takes some minutes.
 
     Collision spheres contain every point of the surface of the moving bodies, so that no contact
-    with an obstacle is missed. Self-collision spheres have the same centers, and some in the base.
-    Their radii agree best with the true geometry in self-collision.
+    with an obstacle is missed. Self-collision spheres are others: their places and radii agree best
+    with the true geometry in self-collision.
 
     Args:
         robot: its kinematics and home are kept, its spheres are not used.
-        num_spheres: on all moving bodies together.
-        num_base_spheres: on each fixed body.
+        num_spheres: collision spheres on all moving bodies together.
         seed: of all random choices.
         progress: called with a line of text now and then.
 
@@ -59,36 +66,64 @@ def fit_spheres(
     moving = [body for body in pieces if model.body_weldid[body]]
     progress(f"fitting {num_spheres} spheres to {len(moving)} moving bodies")
     fitted = _share_out({body: samples[body] for body in moving}, num_spheres, rng, progress)
-    for body in pieces:
-        if body not in moving:
-            fitted[body] = sphere_fit.fit_body(samples[body], num_base_spheres, rng)[:2]
     # The descent saw samples only: grow the spheres until they provably contain the surface.
     proven = {
         body: contain_surface(pieces[body], *fitted[body], leaf=_LEAF) for body in sorted(fitted)
     }
+    # Randomness of its own, so that another number of collision spheres changes nothing here.
+    rng = np.random.default_rng([seed, 1])
     sample = sample_self_collisions(model, _CONFIGURATIONS, rng)
     ignored_pairs = find_ignored_pairs(model, sample)
     write = functools.partial(
         mjcf_writer.collision_mjcf,
         model,
         name=robot.name,
-        collision=_collect({body: proven[body] for body in moving}),
+        collision=_collect(proven),
         home=robot.home,
         mesh_source=robot.mesh_source,
         frozen=robot.frozen,
-        comment=_comment(robot.name, num_spheres, num_base_spheres, seed),
+        comment=_comment(robot.name, num_spheres, seed),
     )
-    self_collision = fit_radii(model, _collect(proven), sample, ignored_pairs, write)
+    write = functools.partial(write, ignored_pairs=ignored_pairs)
+    self_collision = _self_collision_spheres(model, samples, sample, write, rng)
     progress(f"{len(self_collision.body)} spheres take part in self-collision")
-    return write(self_collision=self_collision, ignored_pairs=ignored_pairs)
+    return write(self_collision=self_collision)
 
 
-def _comment(name: str, num_spheres: int, num_base_spheres: int, seed: int) -> str:
+def _self_collision_spheres(
+    model: mujoco.MjModel,
+    samples: dict[int, sphere_fit.BodySamples],
+    sample: SelfCollisions,
+    write: Callable[..., str],
+    rng: np.random.Generator,
+) -> BodySpheres:
+    """Spheres on the bodies that may touch another one, fitted to a sample of self-collisions."""
+    # One dot on each body tells which bodies MuJoCo checks against which.
+    bodies = np.array(sorted(samples))
+    dots = BodySpheres(body=bodies, center=np.zeros((len(bodies), 3)), radius=0.01 + 0.0 * bodies)
+    draft = mujoco.MjModel.from_xml_string(write(self_collision=dots))
+    geoms = np.flatnonzero(draft.geom_group == int(mjcf_writer.SELF_COLLISION_GEOM["group"]))
+    checked = bodies[checked_pairs(draft, geoms)]
+    # Covers to begin with; the fit shrinks them.
+    covers = {}
+    for body in np.unique(checked):
+        length = np.ptp(samples[body].surface, axis=0).max()
+        num = int(np.clip(round(length / _SELF_SPACING), 1, _MOST_SELF))
+        covers[body] = sphere_fit.fit_body(samples[body], num, rng)[:2]
+    if not covers:
+        return BodySpheres(body=bodies[:0], center=np.zeros((0, 3)), radius=np.zeros(0))
+    spheres = _collect(covers)
+    pairs = checked_pairs(draft, geoms[np.searchsorted(bodies, spheres.body)])
+    pairs_of_bodies = {(min(pair), max(pair)) for pair in checked.tolist()}
+    truth = np.array([bool(touching & pairs_of_bodies) for touching in sample.touching])
+    return fit_to_sample(model, spheres, pairs, sample.q, truth)
+
+
+def _comment(name: str, num_spheres: int, seed: int) -> str:
     return f"""
-  Written by the command `vrrt spheres` for {name}: {num_spheres} moving spheres,
-  {num_base_spheres} on the base, seed {seed}.
+  Written by the command `vrrt spheres` for {name}: {num_spheres} collision spheres, seed {seed}.
   cover: contain the convex collision meshes of the moving bodies; checked against obstacles.
-  thin: some of the same centers; radii agree best with the meshes in self-collision.
+  thin: touch each other where the meshes do, as nearly as so many spheres can.
   exclude: bodies that share a joint, and bodies whose meshes touch in none of
   {_CONFIGURATIONS:,} random configurations.
 """
@@ -108,29 +143,28 @@ def _share_out(
     rng: np.random.Generator,
     progress: Callable[[str], None],
 ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Give one sphere after another to the body where it saves the most false alarms."""
+    """Give spheres to the bodies where they save most false alarms, and fit them."""
     if num_spheres < len(samples):
         raise ValueError(
             f"num_spheres is {num_spheres}; expected at least one for each of the {len(samples)} "
             "moving bodies"
         )
-    found = {body: [sphere_fit.fit_body(own, 1, rng)] for body, own in samples.items()}
+    # A few spheres tell how hard a body is to cover: twice as many leave about half the volume.
+    volume = {
+        body: _PROBE * sphere_fit.fit_body(own, _PROBE, rng)[2] for body, own in samples.items()
+    }
     used = dict.fromkeys(samples, 1)
     while sum(used.values()) < num_spheres:
-        gains = {}
-        for body, own in samples.items():
-            # two more at once may help where one more does not: rings, bent links
-            for more in (1, 2):
-                count = used[body] + more
-                if count > sphere_fit.MAX_SPHERES or sum(used.values()) + more > num_spheres:
-                    continue
-                if count > len(found[body]):
-                    found[body].append(sphere_fit.fit_body(own, count, rng))
-                saved = found[body][used[body] - 1][2] - found[body][count - 1][2]
-                gains[body, more] = saved / more
-        if not gains:
+        saved = {
+            body: volume[body] / (count * (count + 1))
+            for body, count in used.items()
+            if count < sphere_fit.MAX_SPHERES
+        }
+        if not saved:
             break
-        body, more = max(gains, key=lambda key: gains[key])
-        used[body] += more
-        progress(f"{sum(used.values())} of {num_spheres} spheres")
-    return {body: found[body][count - 1][:2] for body, count in used.items()}
+        used[max(saved, key=lambda body: saved[body])] += 1
+    fitted = {}
+    for body, count in used.items():
+        fitted[body] = sphere_fit.fit_body(samples[body], count, rng)[:2]
+        progress(f"body {body}: {count} spheres")
+    return fitted

@@ -1,6 +1,7 @@
 """How well spheres agree with the true geometry: misses and false alarms in C MuJoCo."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -40,20 +41,26 @@ class SphereReport:
 
     obstacles: Agreement  # robot against obstacles
     self_collision: Agreement  # robot against itself
+    either: Agreement  # both in one: what a planner is refused
     num: int  # configurations
     seed: int
     missed: dict[tuple[str, str], int]  # missed self-collisions by pair of bodies
 
 
-def measure_spheres(robot: Robot, num: int = 10_000, seed: int = 0) -> SphereReport:
-    """Compare a robot's spheres with its true collision geometry.
-
-    Random configurations in random scenes of eight boxes, spheres, capsules and cylinders each.
+def measure_spheres(
+    robot: Robot,
+    num: int = 10_000,
+    seed: int = 0,
+    scenes: Sequence[Sequence[Obstacle]] = (),
+) -> SphereReport:
+    """Compare a robot's spheres with its true collision geometry, in random configurations.
 
     Args:
         robot: from :func:`vrrt_jax.robots.load_robot`.
-        num: number of configurations, over 20 scenes.
+        num: number of configurations, over all scenes.
         seed: of scenes and configurations.
+        scenes: obstacles of each; without any, 20 random scenes of eight boxes, spheres, capsules
+            and cylinders.
 
     Raises:
         ValueError: the true geometry is nowhere on this machine.
@@ -62,9 +69,9 @@ def measure_spheres(robot: Robot, num: int = 10_000, seed: int = 0) -> SphereRep
     reach = _reach(robot)
     rows: list[list[bool]] = []
     missed: dict[tuple[str, str], int] = {}
-    for scene in np.array_split(np.arange(num), _SCENES):
+    for index, scene in enumerate(np.array_split(np.arange(num), len(scenes) or _SCENES)):
         # One scene twice: with the true geometry, and with the spheres.
-        obstacles = _random_obstacles(rng, reach)
+        obstacles = scenes[index] if scenes else _random_obstacles(rng, reach)
         truth = exact_scene(robot, obstacles, geometry="meshes")
         spheres = exact_scene(robot, obstacles, geometry="spheres")
         for q in rng.uniform(robot.lower, robot.upper, (len(scene), robot.num_joints)):
@@ -77,6 +84,7 @@ def measure_spheres(robot: Robot, num: int = 10_000, seed: int = 0) -> SphereRep
     return SphereReport(
         obstacles=_agreement(found[:, 0], found[:, 2]),
         self_collision=_agreement(found[:, 1], found[:, 3]),
+        either=_agreement(found[:, 0] | found[:, 1], found[:, 2] | found[:, 3]),
         num=num,
         seed=seed,
         missed=missed,

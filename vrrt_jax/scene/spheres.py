@@ -28,11 +28,12 @@ class WorldSpheres:
     # Spheres of a held object may always be as near to obstacles as where it was gripped.
     gripped_distance: jax.Array  # (n, K) of their centers there, infinite for all others [m]
     self_collision: jax.Array  # (L * 12, 3 m) placement of the others
-    contact_distance: jax.Array  # (m, m) at which two of them touch, 0 for unchecked pairs [m]
+    # Of the first a and the last b of them, which contain all pairs to check.
+    contact_distance: jax.Array  # (a, b) at which two of them touch, 0 for unchecked pairs [m]
     # How far a collision sphere moves, and how much the distance of two self-collision spheres
     # changes, at most while one joint moves by one, see ``kinematics.lever_arms``.
     lever_arms: jax.Array  # (D, n) [m/rad] or [m/m]
-    relative_lever_arms: jax.Array  # (D, m, m) the same units
+    relative_lever_arms: jax.Array  # (D, a, b) the same units
     self_margin: jax.Array  # () what is in the contact distances beside radii [m]
     num_held: tuple[int, int] = static(default=(0, 0))  # how many of n, and of m
 
@@ -48,8 +49,14 @@ class WorldSpheres:
         return jnp.min(self.clearances(obstacles, place(self.collision, poses)))
 
     def squared_gaps(self, centers: jax.Array) -> jax.Array:
-        """Squared distances less squared contact distances (m, m) [m^2] of spheres at (3, m)."""
-        return _squared_distances(centers) - self.contact_distance**2
+        """Squared distances less squared contact distances (a, b) [m^2] of spheres at (3, m)."""
+        return self._squared_distances(centers) - self.contact_distance**2
+
+    def _squared_distances(self, centers: jax.Array) -> jax.Array:
+        """Between the first a and the last b of points (3, m), (a, b) [m^2]."""
+        a, b = self.contact_distance.shape
+        x, y, z = centers[:, :a, None] - centers[:, None, centers.shape[1] - b :]
+        return x**2 + y**2 + z**2
 
     def free_span(
         self,
@@ -71,7 +78,7 @@ class WorldSpheres:
         """
         clearance = self.clearances(obstacles, centers[0], margin)
         # Pairs that are not checked are infinitely far apart.
-        apart = jnp.sqrt(_squared_distances(centers[1]) + 1e-12)
+        apart = jnp.sqrt(self._squared_distances(centers[1]) + 1e-12)
         gap = jnp.where(self.contact_distance > 0, apart - self.contact_distance, jnp.inf)
         speed, relative_speed = (
             jnp.tensordot(jnp.abs(edge), arms, 1) + 1e-9
@@ -107,7 +114,8 @@ class WorldSpheres:
         first, second = (-count for count in self.num_held)
         clearance = self.clearances(obstacles, place(self.collision, poses), margin)
         gap = self.squared_gaps(place(self.self_collision, poses))
-        return (jnp.min(clearance[first:]) > 0) & (jnp.min(gap[:, second:]) >= 0)
+        apart = jnp.min(gap[:, second:], initial=jnp.inf)
+        return (jnp.min(clearance[first:]) > 0) & (apart >= 0)
 
 
 def world_spheres(
@@ -130,9 +138,13 @@ def world_spheres(
     num_own = len(radius) - len(held.radius)
     is_other = np.triu(link[:, None] != link[num_own:], 1 - num_own)
     contact_distance[:, num_own:] = is_other * (radius[:, None] + radius[num_own:])
+    # Rows before the last and columns after the first that have a pair to check.
+    is_checked = contact_distance > 0
+    num_rows = np.flatnonzero(is_checked.any(axis=1)).max(initial=-1) + 1
+    begin = np.flatnonzero(is_checked.any(axis=0)).min(initial=len(radius))
     # Joints that carry both spheres of a pair leave their distance as it is.
     own = lever_arms(robot.chain, link, center, robot.lower, robot.upper)
-    first_arm, second_arm = own[:, :, None], own[:, None]
+    first_arm, second_arm = own[:, :num_rows, None], own[:, None, begin:]
     is_between = (first_arm > 0) != (second_arm > 0)
     outer = together(attached, with_corners=True)
     collision = _joined(robot.collision_spheres, outer)
@@ -141,7 +153,7 @@ def world_spheres(
         radius=jnp.asarray(collision[2]),
         gripped_distance=jnp.full((len(collision[2]), len(names)), jnp.inf),
         self_collision=jnp.asarray(placement(link, center, robot.chain.num_links)),
-        contact_distance=jnp.asarray(contact_distance),
+        contact_distance=jnp.asarray(contact_distance[:num_rows, begin:]),
         lever_arms=jnp.asarray(
             lever_arms(robot.chain, *collision[:2], robot.lower, robot.upper), jnp.float32
         ),
@@ -172,9 +184,3 @@ def _joined(*parts: Spheres | HeldSpheres) -> tuple[np.ndarray, np.ndarray, np.n
         np.concatenate([np.asarray(part.center, np.float32) for part in parts]),
         np.concatenate([np.asarray(part.radius, np.float32) for part in parts]),
     )
-
-
-def _squared_distances(centers: jax.Array) -> jax.Array:
-    """Between all pairs (m, m) of points (3, m)."""
-    x, y, z = ((axis[:, None] - axis[None]) ** 2 for axis in centers)
-    return x + y + z

@@ -37,7 +37,7 @@ def test_changes_go_to_their_stage_and_unknown_names_are_told():
     with pytest.raises(ValueError, match="unknown setting 'probes'; have: tree, lineages, expand"):
         PlannerConfig().changed({"probes": 256})
     with pytest.raises(
-        ValueError, match="unknown setting .lineages.probes.; have: lineages.num, lineages.radius"
+        ValueError, match="unknown setting .lineages.probes.; have: lineages.num, lineages.trees"
     ):
         PlannerConfig().changed({"lineages.probes": 256})
 

@@ -18,8 +18,8 @@ from vrrt_jax.robots.robot_spheres import spheres_of
 from vrrt_jax.scene.sphere_errors import measure_spheres
 
 # Bounds on false alarms, against obstacles and itself; measured at 10,000 configurations, seed 0:
-# 2.7 and 1.6 %, 4.7 and 5.0 %, 1.0 and 4.0 %.
-FALSE_ALARMS = {"panda": (0.05, 0.02), "ur5e": (0.05, 0.08), "fetch": (0.02, 0.07)}
+# 1.9 and 1.2 %, 3.0 and 6.6 %, 1.0 and 4.0 %.
+FALSE_ALARMS = {"panda": (0.03, 0.02), "ur5e": (0.04, 0.08), "fetch": (0.02, 0.07)}
 SELF_MISSES = 0.01  # 0.002, 0.001, 0.005
 
 ARM = """
@@ -111,16 +111,17 @@ def test_spheres_fitted_on_loading_contain_the_geometry(arm, rng):
 
 def test_fit_spheres_writes_a_robot(arm, tmp_path, monkeypatch, rng):
     monkeypatch.setattr(robot_fit, "_CONFIGURATIONS", 2000)
-    for name, value in (("_STARTS", 2), ("_STEPS", 100), ("_NUM_OUTSIDE", 600)):
+    for name, value in (("_STARTS", 2), ("_STEPS", 60), ("_NUM_OUTSIDE", 600)):
         monkeypatch.setattr(sphere_fit, name, value)
     lines = []
-    xml = robot_fit.fit_spheres(arm, num_spheres=5, num_base_spheres=2, progress=lines.append)
+    xml = robot_fit.fit_spheres(arm, num_spheres=5, progress=lines.append)
     assert lines
     path = tmp_path / "fitted.xml"
     path.write_text(xml)
     robot = load_robot(path)
     assert len(robot.collision_sphere_bodies) == 5
-    assert sum(body == "base" for body in robot.self_collision_sphere_bodies) <= 2
+    # The base and the arm's end may touch; each has a sphere for every 5 cm.
+    assert set(robot.self_collision_sphere_bodies) == {"base", "fore"}
     assert robot.mesh_source == arm.mesh_source
     model = true_model(arm)
     assert uncovered(model, [2, 3], robot, rng) <= 1e-9

@@ -48,8 +48,9 @@ def nearness(world, q):
 
     def one(q):
         centers = place(world.spheres.self_collision, link_poses(world.chain, q))
-        apart = jnp.linalg.norm(centers[:, :, None] - centers[:, None], axis=0)
-        beyond = jnp.abs(apart - world.spheres.contact_distance)
+        rows, columns = world.spheres.contact_distance.shape
+        between = centers[:, :rows, None] - centers[:, None, centers.shape[1] - columns :]
+        beyond = jnp.abs(jnp.linalg.norm(between, axis=0) - world.spheres.contact_distance)
         to_itself = jnp.min(jnp.where(world.spheres.contact_distance > 0, beyond, jnp.inf))
         return jnp.minimum(jnp.abs(world.obstacle_clearance(q) - world.margin), to_itself)
 

@@ -59,7 +59,7 @@ class RRT(PytreeSubclasses):
         return Proposals(
             parent=parent,
             target=aim,
-            valid=jnp.ones(self.lanes, bool),
+            valid=jnp.all(jnp.isfinite(aim), axis=1),
             partial=jnp.full(self.lanes, self.keep_partial),
             aux=None,
         )
@@ -87,13 +87,24 @@ class RRT(PytreeSubclasses):
         """Length () of the shortest path to the goal, inf if there is none yet."""
         return trees.path_cost(tree, threshold)
 
+    def sample(
+        self, world: Space, goal: ConfigurationGoal, tree: Tree, key: jax.Array
+    ) -> jax.Array:
+        """Configurations (B, D) to extend towards, NaN in lanes that have none."""
+        return sample_configurations(world, key, self.lanes)
+
     def sample_aims(
         self, world: Space, goal: ConfigurationGoal, tree: Tree, key: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Random configurations (B, D) or the goal, and the nodes (B,) nearest to them."""
+        """Random configurations (B, D) or the goal, and the nodes (B,) nearest to them.
+
+        A lane whose aim is not finite sits the iteration out.
+        """
         key_q, key_bias = jax.random.split(key)
-        aim = sample_configurations(world, key_q, self.lanes)
-        at_goal = jax.random.uniform(key_bias, (self.lanes,)) < self.goal_bias
+        aim = self.sample(world, goal, tree, key_q)
+        # No lane aims at a goal that is in the tree already.
+        bias = jnp.where(jnp.min(tree.score) <= goal.threshold, 0.0, self.goal_bias)
+        at_goal = jax.random.uniform(key_bias, (self.lanes,)) < bias
         # The first lane of all tries the straight edge from the start to the goal.
         at_goal = at_goal.at[0].set(at_goal[0] | (tree.iteration == 0))
         aim = jnp.where(at_goal[:, None], goal.q, aim)

@@ -21,6 +21,11 @@ class RRTStar(RRT):
     # Nodes of a sparse tree in seven dimensions lie that far apart.
     rewire_radius: Any = 1.9  # () [rad]
     rewire_steps: int = static(default=96)  # sub-steps of an edge that rewiring checks
+    # Nearest nodes that rewiring looks at, all inside the radius if None; how many edges to them a
+    # new node asks for; how many ancestors of its parent it tries as parents.
+    neighbors: int | None = static(default=None)
+    tries: int = static(default=1)
+    ancestors: int = static(default=0)
 
     @classmethod
     def for_world(cls, world: Space, **settings: Any) -> Self:
@@ -59,5 +64,8 @@ class RRTStar(RRT):
             expansion,
             radius=jnp.float32(self.rewire_radius),
             edge_steps=self.rewire_steps,
-            checks=self.lanes,
+            checks=self.tries * self.lanes,
+            neighbors=self.neighbors,
+            tries=self.tries,
+            ancestors=self.ancestors,
         )

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -31,13 +32,62 @@ def resume(file: Path, header: Mapping[str, Any], fresh: dict[str, Any]) -> dict
         raise ValueError(
             f"'{file}' is no results file of this version ({error!r}); choose another --json"
         ) from None
+    _check_alike(file, old, header)
+    return results
+
+
+def resume_rows(file: Path, header: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Rows that a run has left in a file that grows, to go on with; a new file begins here.
+
+    The first line is the header, each other one a row. A last line that was cut off while it was
+    written is taken away.
+
+    Args:
+        file: JSON lines, see :func:`append_row`.
+        header: what the file must agree on.
+
+    Raises:
+        ValueError: the file is none of this kind, or of another benchmark, version or seed.
+        OSError: the file cannot be written.
+    """
+    text = file.read_text() if file.exists() else ""
+    whole = text[: text.rfind("\n") + 1]
+    if whole != text:
+        with replacing(file, "w") as handle:
+            handle.write(whole)
+    if not whole:
+        append_row(file, header)
+        return []
+    try:
+        old, *rows = [json.loads(line) for line in whole.splitlines()]
+        old = {name: old[name] for name in header}
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"'{file}' holds no rows of this version ({error!r}); choose another --json"
+        ) from None
+    _check_alike(file, old, header)
+    return rows
+
+
+def append_row(file: Path, row: Mapping[str, Any]) -> None:
+    """Write one more line, which is on the disk when this returns.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with open(file, "a") as handle:
+        handle.write(json.dumps(row) + "\n")
+        handle.flush()
+        os.fsync(handle.fileno())
+
+
+def _check_alike(file: Path, old: Mapping[str, Any], header: Mapping[str, Any]) -> None:
     for name, value in header.items():
         if old[name] != value:
             raise ValueError(
                 f"'{file}' has {name} {old[name]!r}, this run {value!r}: results of different "
                 "runs are not mixed; choose another --json"
             )
-    return results
 
 
 def write(file: Path, results: Mapping[str, Any]) -> None:

@@ -1,0 +1,87 @@
+"""The planners of homes by name."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from nrp_jax.config import EDGE_STEPS, PlannerConfig
+from nrp_jax.planners.nrp import NeuralRRT
+from nrp_jax.planners.nrp_connect import NRPConnect, packaged_sampler
+from nrp_jax.planners.nrp_star import NeuralRRTStar
+from nrp_jax.samplers import check_fits, load_sampler
+from nrp_jax.scene.robots import MobileRobot
+from nrp_jax.scene.world import GridWorld
+from vrrt_jax.core.planners import RRT, BITStar, InformedRRTStar, RRTConnect, RRTStar
+from vrrt_jax.core.types import ExpansionPolicy
+
+CONNECT = ("nrp-connect", "nrp-star-connect")
+# Those of the last row go on to improve their paths until the budget ends.
+PLANNERS = (
+    *("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g", "nrp-connect"),
+    *("rrt-star", "irrt-star", "bit-star", "nrp-star-d", "nrp-star-g", "nrp-star-connect"),
+)
+# Of the samplers that planners need.
+KINDS = {
+    "nrp-d": "discriminator",
+    "nrp-g": "cvae",
+    "nrp-star-d": "discriminator",
+    "nrp-star-g": "cvae",
+    **dict.fromkeys(CONNECT, "cvae"),
+}
+# How trees are rewired.
+REWIRING = {
+    "rewire_radius": np.float32(np.inf),
+    "rewire_steps": 32,
+    "neighbors": 8,
+    "tries": 4,
+    "ancestors": 4,
+}
+
+
+def policy_of(
+    planner: str | ExpansionPolicy,
+    robot: MobileRobot,
+    world: GridWorld,
+    sampler: Any,
+    config: PlannerConfig,
+) -> ExpansionPolicy:
+    """The policy of a planner by name, or the object itself.
+
+    Args:
+        planner: one of :data:`PLANNERS`, or a policy.
+        robot: to plan for.
+        world: the robot in a home.
+        sampler: of the "nrp-" planners; the packaged one if None.
+        config: settings.
+
+    Raises:
+        ValueError: the sampler does not fit.
+    """
+    if not isinstance(planner, str):
+        return planner
+    if planner == "rrt-connect":
+        return RRTConnect(lanes=max(config.lanes, 2))
+    bias = jnp.float32(config.goal_bias)
+    shape = {"keep_partial": True, "lanes": config.lanes, "edge_steps": EDGE_STEPS}
+    if planner in ("rrt", "rrt-is"):
+        return RRT(goal_bias=bias, intermediate=planner == "rrt-is", **shape)
+    if planner == "bit-star":
+        return BITStar(lanes=config.lanes, edge_steps=EDGE_STEPS)
+    if planner in ("rrt-star", "irrt-star"):
+        make = RRTStar if planner == "rrt-star" else InformedRRTStar
+        return make(goal_bias=bias, **shape, **REWIRING)
+    # The others have learned samplers.
+    if sampler is None:
+        packaged = planner in CONNECT
+        sampler = (
+            packaged_sampler(robot.name) if packaged else load_sampler(robot.name, KINDS[planner])
+        )
+    check_fits(sampler, robot, world, KINDS[planner])
+    if planner in CONNECT:
+        return NRPConnect(sampler=sampler, lanes=max(config.lanes, 2))
+    rate = jnp.float32(config.straight_rate)
+    learned = {"goal_bias": bias, "sampler": sampler, "straight_rate": rate, **shape}
+    if planner.startswith("nrp-star"):
+        return NeuralRRTStar(**learned, **REWIRING)
+    return NeuralRRT(**learned)

@@ -1,0 +1,1 @@
+"""From a path to the robot: limits of motion, trajectories, files, simulated execution."""
