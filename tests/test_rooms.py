@@ -30,7 +30,7 @@ NRP_ROOMS = (
     ("samplers",),
     ("planners",),
     ("planner", "problems"),
-    ("viz", "viewer"),
+    ("viz",),
     ("bench",),
     ("cli",),
 )

@@ -28,7 +28,7 @@ from vrrt_jax.viz import ScenePainter, along, over_sky
 
 PICTURES = 151  # along a path: five seconds of play
 PICTURE_PX = 240  # height of the goal image and of the end beside it
-MOST_EDGES = 50_000  # drawn of a tree
+MOST_EDGES = 2_000  # drawn of a tree: all of a large one would hide the robot
 EDGE_POINTS = 5  # along an edge, which is a curve in space
 _SURFACE_GROUP = 4  # of the spheres that follow the surface, in ``Robot.xml``
 _WAY, _PATH = (255, 150, 40), (214, 40, 57)
@@ -138,11 +138,11 @@ def _model(robot: Robot, world: World) -> tuple[mujoco.MjModel, tuple[int, ...]]
 def _add_lines(page: Page, plan: _Plan, world: World, trajectory: np.ndarray) -> None:
     """The tree by loss, its way to the goal, and the path, as places of the hand."""
     robot, nodes = world.robot.value, plan.nodes
-    child = nodes.edges(MOST_EDGES)
+    child = nodes.best_edges(MOST_EDGES)
     # On a scale of powers of ten, as in the figures.
     colors = colors_of(np.log10(nodes.score[child] + 1e-9))
     start, end = nodes.q[nodes.parent[child]], nodes.q[child]
-    page.add_lines("tree (strong: low loss)", _curves(world, start, end), colors, 1.0)
+    page.add_lines("best of the tree (strong: low loss)", _curves(world, start, end), colors, 1.0)
     raw = plan.raw_path
     page.add_lines("way in the tree", _curves(world, raw[:-1], raw[1:]), np.array(_WAY), 3.0)
     page.add_lines("path", _tips(robot, trajectory)[None], np.array(_PATH), 5.0)

@@ -18,10 +18,10 @@ class Nodes:
     parent: np.ndarray  # (N,) int, index of the parent, -1 for a root
     score: np.ndarray  # (N,) lower is better
 
-    def edges(self, most: int) -> np.ndarray:
-        """Children (E,) int of all edges, or of evenly spaced ones if there are more than most."""
+    def best_edges(self, most: int) -> np.ndarray:
+        """Children (E,) int of at most so many edges, those of the lowest scores, in order."""
         child = np.flatnonzero(self.parent >= 0)
-        return child[:: max(1, -(-len(child) // most))]
+        return np.sort(child[np.argsort(self.score[child], kind="stable")[:most]])
 
 
 def nodes_of(tree: Tree) -> Nodes:

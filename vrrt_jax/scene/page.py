@@ -46,11 +46,18 @@ class Page:
         self._server.scene.set_up_direction("+z")
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._closed, self._playing = threading.Event(), threading.Event()
+        self.slider: Any = None  # along the path, once there is a motion
+        self.moving: dict[int, Any] = {}  # bodies that move, by number in the model
+
+    @property
+    def host(self) -> str:
+        """The address that is listened at."""
+        return self._server.get_host()
 
     @property
     def url(self) -> str:
         """Where the page is."""
-        return f"http://{HOST}:{self._server.get_port()}"
+        return f"http://{self.host}:{self._server.get_port()}"
 
     @property
     def scene(self) -> Any:
@@ -89,10 +96,11 @@ class Page:
                 for body, handle in frames:
                     handle.position, handle.wxyz = position[step, body], quaternion[step, body]
 
-        self._add_player(len(trajectory), show)
+        self.slider = self._add_player(len(trajectory), show)
+        self.moving = dict(frames)
 
-    def _add_player(self, num: int, show: Callable[[int], None]) -> None:
-        """A slider over ``num`` pictures, and a button that plays them."""
+    def _add_player(self, num: int, show: Callable[[int], None]) -> Any:
+        """A slider over ``num`` pictures, and a button that plays them; the slider."""
         gui, last = self._server.gui, num - 1
         slider = gui.add_slider("along the path", 0, max(last, 1), 1, 0, disabled=not last)
         button = gui.add_button("play", disabled=not last)
@@ -116,6 +124,7 @@ class Page:
                     self._playing.clear()
 
         threading.Thread(target=play, daemon=True).start()
+        return slider
 
     def add_mesh(
         self, name: str, vertices: np.ndarray, faces: np.ndarray, color: tuple[int, int, int]
