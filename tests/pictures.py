@@ -16,7 +16,7 @@ QUICK = vrrt_jax.PlannerConfig().changed(
 )
 
 
-def picture(panda, self_model, camera, q, level=1):
+def picture(panda, self_model, camera, q, level=2):
     splats = self_model.levels[level].splats
     poses = vrrt_jax.link_poses(panda.chain, jnp.asarray(q))
     rgb, alpha = jax.jit(vrrt_jax.render)(splats, poses, camera)

@@ -69,6 +69,7 @@ def test_batch_equals_single_plans(panda, self_model, camera, image, open_world)
             "budget.settle_iterations": 0,
             "budget.attempts": 1,
             "polish.hypotheses": 0,
+            "lineages.trees": 1,  # as in a batch
         }
     )
     other = picture(panda, self_model, camera, Q_GOAL + 0.2)

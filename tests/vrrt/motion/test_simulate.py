@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from vrrt_jax import MotionLimits, Obstacle, execute_in_sim, time_parameterize
+from vrrt_jax import MotionLimits, Obstacle, execute_in_sim, load_robot, time_parameterize
 from vrrt_jax.robots import mesh_sources
 
 LINE = np.array([[0.0, 0.0], [2.0, 0.0]])
@@ -54,16 +54,17 @@ def test_the_panda_tracks_with_its_true_masses(panda):
 
 
 @pytest.mark.parametrize("name", ["ur5e", "fetch"])
-def test_packaged_robots_have_masses(name):
-    import vrrt_jax
-
-    robot = vrrt_jax.load_robot(name)
+def test_packaged_robots_have_masses_and_track(name):
+    """The Fetch too, whose joints are damped so much that instants say little of steps."""
+    robot = load_robot(name)
     spec = mesh_sources.inertial_spec(robot)
     if spec is None:
         pytest.skip(f"the masses of the {name} are not installed")
     model = spec.compile()
     assert tuple(model.joint(j).name for j in range(model.njnt)) == robot.joint_names
     assert np.ptp(model.body_mass[1:]) > 1  # not all the same
+    path = np.stack([robot.home, robot.home + 0.05])
+    assert execute_in_sim(robot, [], time_parameterize(robot, path)).max_error < 0.002
 
 
 def test_other_robots_and_masses_are_refused(panda, gantry, timed):

@@ -223,7 +223,7 @@ def test_a_path_that_drags_the_object_through_a_wall_is_refused(panda):
     seen = verify_path(panda, held, path)
     assert not seen.ok and "stick touches wall" in str(seen.contact)
     result = vrrt_jax.plan_to_configuration(panda, held, START, goal, key=jax.random.key(0))
-    assert result.ok and result.cost > 1.5
+    assert result.ok and result.cost > 1.35  # the straight line is 1.3 long
     assert verify_path(panda, held, result.path, step=0.002).ok
 
 
