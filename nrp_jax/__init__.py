@@ -7,6 +7,7 @@ from nrp_jax.samplers import load_sampler
 from nrp_jax.scene.nearest import nearest_free
 from nrp_jax.scene.robots import MobileRobot, link_features, load_robot
 from nrp_jax.scene.world import GridWorld, batch_is_free, build_world, is_free, with_grid
+from nrp_jax.viewer import view
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.result import PlanResult, Status, Verification
 
@@ -28,5 +29,6 @@ __all__ = [
     "load_sampler",
     "nearest_free",
     "plan",
+    "view",
     "with_grid",
 ]

@@ -9,6 +9,7 @@ from pathlib import Path
 from vrrt_jax.core import command
 from vrrt_jax.core.command import EXIT_SOLVED, EXIT_UNSOLVED
 from vrrt_jax.core.files import replacing
+from vrrt_jax.core.tree_file import nodes_of, save_nodes
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -28,6 +29,10 @@ def _parser() -> argparse.ArgumentParser:
     for module in (figure, data, train, score, report):
         module.add_arguments(commands)
     _add_plan(commands)
+    view = commands.add_parser("view", help="show a plan in the browser")
+    view.set_defaults(run=_view)
+    view.add_argument("folder", help="what nrp plan wrote with --out")
+    command.add_port(view)
     bench = commands.add_parser("bench", help="measure speed and success")
     benches = bench.add_subparsers(dest="what", required=True)
     for module in (checks, planning, curves):
@@ -64,7 +69,7 @@ def _add_plan(commands) -> None:
     )
     plan.add_argument("--time-limit", type=command.seconds, default=60.0, help="of the search [s]")
     plan.add_argument("--seed", type=command.seed, default=0, help="of all that is random")
-    plan.add_argument("--out", default="out", help="folder for path.json and plan.png")
+    plan.add_argument("--out", default="out", help="folder for path.json, map, tree and plan.png")
     plan.add_argument("--no-pictures", action="store_true", help="no plan.png")
 
 
@@ -107,6 +112,9 @@ def _plan(arguments: argparse.Namespace) -> int:
     out, record = Path(arguments.out), _record(problem, method, arguments.seed, result)
     with command.or_printed(lambda: json.dumps(record)), replacing(out / "path.json", "w") as file:
         file.write(json.dumps(record, indent=1))
+        # What nrp view shows beside it.
+        problem.grid.save(out / "map.npz")
+        save_nodes(nodes_of(result.tree), out / "tree.npz")
     if not arguments.no_pictures:
         from nrp_jax.viz import save_plan
 
@@ -121,6 +129,13 @@ def _plan(arguments: argparse.Namespace) -> int:
             file=sys.stderr,
         )
     return EXIT_SOLVED if result.ok else EXIT_UNSOLVED
+
+
+def _view(arguments: argparse.Namespace) -> int:
+    from nrp_jax.viewer import view_folder
+
+    view_folder(Path(arguments.folder), port=arguments.port).serve()
+    return EXIT_SOLVED
 
 
 def _problem(arguments: argparse.Namespace):
@@ -161,18 +176,14 @@ def _problem(arguments: argparse.Namespace):
 
 def _record(problem, method: str, seed: int, result) -> dict:
     """What ``path.json`` holds."""
+    from nrp_jax.viewer import outcome
+
     return {
         "robot": problem.robot.name,
         "map": str(problem.map_file),
         "method": method,
         "seed": seed,
-        "status": result.status.name,
-        "refused": result.refused,
-        "verified": bool(result.verification and result.verification.ok),
-        "cost": round(result.cost, 4),
-        "expansions": result.expansions,
-        "nodes": int(result.tree.size),
-        "timing": {k: round(v, 4) for k, v in result.timing.items()},
+        **outcome(result),
         "path": [[round(float(v), 7) for v in q] for q in result.path],
         "trajectory": [[round(float(v), 7) for v in q] for q in result.trajectory],
     }

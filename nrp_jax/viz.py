@@ -13,6 +13,7 @@ from nrp_jax.planner import PlanResult
 from nrp_jax.scene.nearest import shifted, working_world
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld
+from vrrt_jax.core.tree_file import Nodes, nodes_of
 
 _EDGE_POINTS = 9  # drawn along an edge
 _MAX_EDGES = 4000  # drawn of a tree
@@ -82,21 +83,23 @@ def draw_tree(axes, world: GridWorld, result: PlanResult) -> None:
     """Draw the path of the base along the edges of the search tree."""
     from matplotlib.collections import LineCollection
 
-    size = int(result.tree.size)
-    parent = np.asarray(result.tree.parent)[:size]
-    # Every edge, or evenly spaced ones of a large tree, as a line of several points.
-    child = np.flatnonzero(parent >= 0)
-    child = child[:: max(1, -(-len(child) // _MAX_EDGES))]
+    nodes = nodes_of(result.tree)
+    child = nodes.edges(_MAX_EDGES)
     if not len(child):
         return
+    lines = list(base_lines(world, nodes, child))
+    axes.add_collection(LineCollection(lines, colors=_COLORS["tree"], linewidths=0.5))
+
+
+def base_lines(world: GridWorld, nodes: Nodes, child: np.ndarray) -> np.ndarray:
+    """The way of the base (E, P, 2) [m] along the edges that lead to some nodes (E,)."""
     world, corner = working_world(world)
-    q = shifted(np.asarray(result.tree.q), -corner).astype(np.float32)
+    q = shifted(nodes.q, -corner).astype(np.float32)
     fraction = jnp.linspace(0, 1, _EDGE_POINTS)[None]
     lines = jax.jit(lambda w, a, b: w.interpolate(a[:, None], b[:, None], fraction))(
-        world, q[parent[child]], q[child]
+        world, q[nodes.parent[child]], q[child]
     )
-    lines = list(shifted(np.asarray(lines), corner)[..., :2])
-    axes.add_collection(LineCollection(lines, colors=_COLORS["tree"], linewidths=0.5))
+    return shifted(np.asarray(lines), corner)[..., :2]
 
 
 def save_plan(

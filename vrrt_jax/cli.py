@@ -168,11 +168,9 @@ def _plan(arguments: argparse.Namespace) -> int:
 
 
 def _view(arguments: argparse.Namespace) -> int:
-    from vrrt_jax import viewer
+    from vrrt_jax.viewer import view_folder
 
-    page = viewer.view_folder(Path(arguments.folder), port=arguments.port)
-    print(f"{page.url} shows {arguments.folder}; Ctrl-C ends it", flush=True)
-    page.serve()
+    view_folder(Path(arguments.folder), port=arguments.port).serve()
     return EXIT_SOLVED
 
 

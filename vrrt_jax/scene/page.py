@@ -171,7 +171,8 @@ class Page:
         self._server.gui.add_html(f'<div style="{_TABLE_STYLE}"><table>{rows}</table></div>')
 
     def serve(self) -> None:
-        """Wait until Ctrl-C, then end the page."""
+        """Say where the page is, wait until Ctrl-C, then end the page."""
+        print(f"open {self.url}; Ctrl-C ends it", flush=True)
         with contextlib.suppress(KeyboardInterrupt):
             self._closed.wait()
         self.close()
