@@ -43,7 +43,9 @@ def plan_by_loss(
         result = attempt(robot, world, problem, policy, roots, key, config, on_progress)
         for again in range(1, config.budget.attempts):
             rest = time_left(config, result.timing["search_s"])
-            if result.status not in RETRYABLE or rest.budget.time_limit_s == 0:
+            # A match in strange colors is believed, if the next attempt finds no better one.
+            goes_on = result.status in RETRYABLE or (again == 1 and _has_strange_colors(result))
+            if not goes_on or rest.budget.time_limit_s == 0:
                 break
             key = jax.random.fold_in(key, ATTEMPT_KEY - again)
             # Where the start is walled in, what its tree does not reach is looked at too.
@@ -57,9 +59,19 @@ def plan_by_loss(
                 # It ended before its loss could be compared with the other's.
                 best = dataclasses.replace(result, status=other.status, advice=other.advice)
             else:
-                best = min(result, other, key=lambda r: (not r.ok, r.loss))
+                best = min(result, other, key=_rank)
             result = with_time_of(best, result, other)
     return result
+
+
+def _has_strange_colors(result: PlanResult) -> bool:
+    return result.ok and result.colored_loss > result.match_threshold
+
+
+def _rank(result: PlanResult) -> tuple[bool, float]:
+    """Solved plans come first; of these, and of the others, the better matches."""
+    known = result.ok and np.isfinite(result.colored_loss)
+    return not result.ok, result.colored_loss if known else result.loss
 
 
 def free_around(

@@ -49,6 +49,7 @@ def outcome(world: World, result: PlanResult) -> dict[str, Any]:
         "clearance_m": _number(result.clearance),
         "loss": result.loss,
         "goal_loss": result.match_threshold,
+        "colored_loss": result.colored_loss if np.isfinite(result.colored_loss) else None,
         "cost": result.cost,
         "raw_cost": path_length(world, result.raw_path),
         "q_goal": np.round(result.q_goal.astype(float), 6).tolist(),

@@ -77,6 +77,9 @@ class PlanResult:
     tree: Tree
     # Smallest distance of the collision spheres to obstacles on the path [m], where it is measured.
     clearance: float = float("nan")
+    # Image loss of the target with colors counted ten times as much; above ``match_threshold`` it
+    # says that the light is another one than the self-model's, or that the pose is wrong.
+    colored_loss: float = float("nan")
     # (D,) how far each joint of the target may be off while the image still matches, the others
     # following [rad] or [m], at most pi; None where nothing tells.
     joint_uncertainty: np.ndarray | None = None

@@ -19,7 +19,7 @@ from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots.kinematics import Chain, link_poses
 from vrrt_jax.splat.fit_config import FitConfig
 from vrrt_jax.splat.images import View, shrink_views
-from vrrt_jax.splat.loss import weighted, weighted_goal
+from vrrt_jax.splat.loss import MATCH_COLOR_WEIGHT, weighted, weighted_goal
 from vrrt_jax.splat.model import Level, SelfModel
 from vrrt_jax.splat.mujoco_images import MeshRenderer
 from vrrt_jax.splat.photographs import Photograph, photograph
@@ -135,7 +135,8 @@ def _draw(chain: Chain, splats: SplatModel, cameras: Camera, q: jax.Array):
 
 @jax.jit
 def _loss(image: tuple[jax.Array, jax.Array], goal: GoalImage) -> jax.Array:
-    return jnp.sum((weighted(*image, goal) - weighted_goal(goal)) ** 2)
+    drawn = weighted(*image, goal, MATCH_COLOR_WEIGHT)
+    return jnp.sum((drawn - weighted_goal(goal, MATCH_COLOR_WEIGHT)) ** 2)
 
 
 def _threshold(of_level: dict[str, list]) -> float:

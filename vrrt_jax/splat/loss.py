@@ -3,7 +3,8 @@
 A self-model is trained under one lamp, and nobody knows the lamp of a goal image. Each color
 channel of a render is therefore scaled by the gain that suits the goal best, in closed form, and
 what would be brighter than white is white. Shading remains: a lamp from the side darkens the other
-side. Colors therefore count less than coverage, which no lamp changes.
+side. Colors therefore count less than coverage, which no lamp changes: a little where poses are
+compared with each other, and next to nothing where it is judged whether a pose matches at all.
 """
 
 import jax
@@ -14,7 +15,11 @@ from vrrt_jax.splat.raster import render
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
 from vrrt_jax.splat.windows import Windows
 
-COLOR_WEIGHT = 0.01  # of a squared color error, relative to the goal's brightness, beside coverage
+# Weights of a squared color error, relative to the goal's brightness, beside coverage. Only colors
+# tell an arm in front of its own body.
+COLOR_WEIGHT = 0.1
+# Here another lamp raises the loss at a right pose by half, and there up to four times.
+MATCH_COLOR_WEIGHT = 0.01
 OVEREXPOSED = 0.97  # from which on a pixel may have been brighter than the image can say
 FEW_PIXELS = 1e-4  # share of an image that tells no gain; without more, the gain is near 1
 DARKEST = 0.02  # mean brightness of a robot, below which its noise is not scaled up any more
@@ -74,6 +79,7 @@ def goal_loss(
     goal: GoalImage,
     q: jax.Array,
     windows: Windows | None = None,
+    color_weight: float | jax.Array = COLOR_WEIGHT,
 ) -> jax.Array:
     """Loss of a configuration: weighted squared errors of color and alpha, the mean over V views.
 
@@ -84,12 +90,13 @@ def goal_loss(
         goal: V images.
         q: (D,) the configuration [rad] or [m].
         windows: to render with, if any.
+        color_weight: () of colors.
 
     Returns:
         ().
     """
-    image = weighted_image(chain, splats, cameras, goal, q, windows)
-    return jnp.sum((image - weighted_goal(goal)) ** 2)
+    image = weighted_image(chain, splats, cameras, goal, q, windows, color_weight)
+    return jnp.sum((image - weighted_goal(goal, color_weight)) ** 2)
 
 
 def _render_views(
@@ -108,6 +115,7 @@ def weighted_image(
     goal: GoalImage,
     q: jax.Array,
     windows: Windows | None = None,
+    color_weight: float | jax.Array = COLOR_WEIGHT,
 ) -> jax.Array:
     """The image of a configuration, as a vector for least squares.
 
@@ -118,32 +126,39 @@ def weighted_image(
         (V * H * W * 4,), see :func:`weighted`.
     """
     views = _render_views(chain, splats, cameras, q, windows)
-    return weighted(jnp.stack([rgb for rgb, _ in views]), jnp.stack([a for _, a in views]), goal)
+    rgb, alpha = (jnp.stack(channels) for channels in zip(*views, strict=True))
+    return weighted(rgb, alpha, goal, color_weight)
 
 
-def weighted(rgb: jax.Array, alpha: jax.Array, goal: GoalImage) -> jax.Array:
+def weighted(
+    rgb: jax.Array,
+    alpha: jax.Array,
+    goal: GoalImage,
+    color_weight: float | jax.Array = COLOR_WEIGHT,
+) -> jax.Array:
     """Images as a vector for least squares, in the light of the goal.
 
     Args:
         rgb: (V, H, W, 3) the robot over black.
         alpha: (V, H, W).
         goal: V images.
+        color_weight: () of colors.
 
     Returns:
         (V * H * W * 4,) colors and alphas, times the root of each one's weight.
     """
     rgb = jax.vmap(relit)(rgb, alpha, goal.rgb, goal.alpha, goal.valid)
     image = jnp.concatenate([rgb, alpha[..., None]], axis=-1)
-    return (image * _root_weight(goal)).ravel()
+    return (image * _root_weight(goal, color_weight)).ravel()
 
 
-def weighted_goal(goal: GoalImage) -> jax.Array:
+def weighted_goal(goal: GoalImage, color_weight: float | jax.Array = COLOR_WEIGHT) -> jax.Array:
     """The goal as a vector (V * H * W * 4,), see :func:`weighted_image`."""
     image = jnp.concatenate([goal.rgb, goal.alpha[..., None]], axis=-1)
-    return (image * _root_weight(goal)).ravel()
+    return (image * _root_weight(goal, color_weight)).ravel()
 
 
-def _root_weight(goal: GoalImage) -> jax.Array:
+def _root_weight(goal: GoalImage, color_weight: float | jax.Array) -> jax.Array:
     """(V, H, W, 4) root of each number's weight in the mean over views.
 
     Errors of color are relative to the robot's mean brightness in each view.
@@ -151,7 +166,7 @@ def _root_weight(goal: GoalImage) -> jax.Array:
     num_valid = jnp.maximum(jnp.sum(goal.valid, axis=(1, 2)), 1.0)
     covered = jnp.maximum(jnp.sum(goal.valid * goal.alpha, axis=(1, 2)), 1e-6)
     brightness = jnp.sum(goal.valid[..., None] * goal.rgb, axis=(1, 2, 3)) / (3.0 * covered)
-    color = COLOR_WEIGHT / jnp.maximum(brightness, DARKEST) ** 2
+    color = color_weight / jnp.maximum(brightness, DARKEST) ** 2
     channels = jnp.stack([color, color, color, jnp.ones_like(color)], axis=-1)
     pixel = goal.valid / (4.0 * len(goal.valid) * num_valid[:, None, None])
     return jnp.sqrt(pixel[..., None] * channels[:, None, None])

@@ -38,6 +38,7 @@ class Ends:
 
     q: np.ndarray  # (n, D)
     loss: np.ndarray  # (n,)
+    colored_loss: np.ndarray  # (n,) see PlanResult
     cost: np.ndarray  # (n,) which tells apart those that look alike
     order: list[int]  # which to try, the best first
     rivals: list[int]  # which of them are worth naming beside the one that is taken
@@ -121,6 +122,7 @@ def finish_visual(
     return dataclasses.replace(
         result,
         match_probability=probability,
+        colored_loss=float(ends.colored_loss[end]),
         alternatives=ends.q[alike],
         joint_uncertainty=uncertainty,
         search_match_threshold=search_threshold,
@@ -173,14 +175,16 @@ def _choose_ends(
     order = _best_nodes(world, score, q, q_start, MAX_GOALS, threshold)
     paths = {end: trees.branch_path(found.tree, end) for end in order}
     paths = {end: path for end, path in paths.items() if np.array_equal(path[0], q_start)}
-    loss = score
-    if not isinstance(policy, VisualRRT | LineageRRT):  # whose scores are losses
-        loss = score.copy()
-        loss[order] = [float(problem.goal.loss(world, jnp.asarray(q[end]))) for end in order]
+    # Scores of planners to images are losses, but those of a match are judged otherwise.
+    goal, loss = problem.goal, score.copy()
+    judge = getattr(goal, "judge", goal)
+    if judge is not goal or not isinstance(policy, VisualRRT | LineageRRT):
+        loss[order] = [float(judge.loss(world, jnp.asarray(q[end]))) for end in order]
     # On a small image even neighbors look the same: there are no rivals to name.
     return found, Ends(
         q=q,
         loss=loss,
+        colored_loss=score,
         cost=score,
         order=order,
         rivals=[],
@@ -207,6 +211,7 @@ def _polished_ends(
     return Ends(
         q=polished.q,
         loss=polished.loss,
+        colored_loss=polished.colored_loss,
         cost=polished.cost,
         order=matched or rivals or [int(np.argmin(polished.loss))],  # the last: all collide
         rivals=rivals,

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,13 @@ from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import batch_link_poses
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.splat.images import View, check_views, shrink_views
-from vrrt_jax.splat.loss import goal_loss, weighted_goal, weighted_image
+from vrrt_jax.splat.loss import (
+    COLOR_WEIGHT,
+    MATCH_COLOR_WEIGHT,
+    goal_loss,
+    weighted_goal,
+    weighted_image,
+)
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel
 from vrrt_jax.splat.windows import Windows, choose_windows
@@ -35,18 +41,26 @@ class ImageObjective(LeastSquaresGoal):
     cameras: Camera  # leading axis V
     image: GoalImage
     threshold: Any  # () loss of a match
+    color_weight: Any = COLOR_WEIGHT  # () of colors beside coverage
+
+    @property
+    def judge(self) -> Self:
+        """The same goal as it is judged: in other light than the self-model's a match stays one."""
+        return dataclasses.replace(self, color_weight=jnp.float32(MATCH_COLOR_WEIGHT))
 
     def loss(self, world: Any, q: jax.Array) -> jax.Array:
         """Weighted squared errors () of the rendered configuration (D,), in the goal's light."""
-        return goal_loss(world.chain, self.splats, self.cameras, self.image, q, self.windows)
+        views = self.cameras, self.image
+        return goal_loss(world.chain, self.splats, *views, q, self.windows, self.color_weight)
 
     def prediction(self, world: Any, q: jax.Array) -> jax.Array:
         """The rendered configuration (D,) as a weighted vector (V * H * W * 4,)."""
-        return weighted_image(world.chain, self.splats, self.cameras, self.image, q, self.windows)
+        views = self.cameras, self.image
+        return weighted_image(world.chain, self.splats, *views, q, self.windows, self.color_weight)
 
     def target(self) -> jax.Array:
         """The goal images as a weighted vector (V * H * W * 4,)."""
-        return weighted_goal(self.image)
+        return weighted_goal(self.image, self.color_weight)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -120,6 +134,7 @@ class ImageGoal:
             cameras=shrunk_cameras,
             image=image,
             threshold=match_scale * level.match_threshold * covered,
+            color_weight=jnp.float32(COLOR_WEIGHT),
         )
 
     def close_up(self, image_px: int, match_scale: float = 1.0) -> CloseUp | None:
@@ -139,6 +154,7 @@ class ImageGoal:
             cameras=shrunk_cameras,
             image=image,
             threshold=0.0,
+            color_weight=jnp.float32(COLOR_WEIGHT),
         )
         return CloseUp(
             objective=objective, px=level.size_px, threshold=match_scale * level.match_threshold

@@ -87,8 +87,9 @@ class Polished:
     """Distinct ends of polishing, best first."""
 
     q: np.ndarray  # (n, D)
-    loss: np.ndarray  # (n,) on the fine image
-    cost: np.ndarray  # (n,) with the prior and the close-up, infinite in collision
+    loss: np.ndarray  # (n,) on the fine image, as it is judged
+    colored_loss: np.ndarray  # (n,) on the fine image, as it is searched
+    cost: np.ndarray  # (n,) the same with the prior and the close-up, infinite in collision
     uncertainty: np.ndarray  # (n, D) how far off a joint may be, see :func:`joint_uncertainty`
 
 
@@ -127,17 +128,21 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
     turned = _turns_oflast_hinge(world, fine, q, config.kept)
     ends = _descend(lambda q: _linearize(world, fine, q), turned, config.steps)
     kept = _with_twins(world, fine, _distinct_ends(world, ends, config.kept), config)
-    loss = kept.loss
 
     # The close-up of the hand, together with the fine image.
     if polishing.close_up is not None:
         ends = _descend_close_up(world, polishing, polishing.close_up, kept)
         kept = _distinct_ends(world, ends, config.kept)
-        loss = _linearize(world, fine, kept.q).loss
+    colored = _linearize(world, fine, kept.q).loss
+    judge = getattr(fine.goal, "judge", None)
+    loss = colored
+    if judge is not None:
+        loss = _linearize(world, dataclasses.replace(fine, goal=judge), kept.q).loss
     informed = kept.matrix - float(fine.prior) * np.eye(q.shape[1])
     return Polished(
         q=kept.q,
         loss=loss,
+        colored_loss=colored,
         cost=np.where(kept.free, kept.cost, np.inf),
         uncertainty=joint_uncertainty(informed, polishing.threshold),
     )
