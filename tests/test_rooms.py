@@ -30,7 +30,7 @@ NRP_ROOMS = (
     ("samplers",),
     ("planners",),
     ("planner", "problems"),
-    ("viz",),
+    ("viz", "viewer"),
     ("bench",),
     ("cli",),
 )

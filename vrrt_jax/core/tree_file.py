@@ -18,6 +18,12 @@ class Nodes:
     parent: np.ndarray  # (N,) int, index of the parent, -1 for a root
     score: np.ndarray  # (N,) lower is better
 
+    def edges(self, most: int) -> np.ndarray:
+        """Children (E,) int of at most so many edges, evenly over the order of growth."""
+        child = np.flatnonzero(self.parent >= 0)
+        every = np.linspace(0, len(child) - 1, min(most, len(child))).astype(int)
+        return child[every]
+
     def best_edges(self, most: int) -> np.ndarray:
         """Children (E,) int of at most so many edges, those of the lowest scores, in order."""
         child = np.flatnonzero(self.parent >= 0)

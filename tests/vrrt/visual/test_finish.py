@@ -78,13 +78,19 @@ def test_a_way_obeys_an_is_free_of_ones_own(slider):
         vrrt_jax.plan_to_configuration(slider, zone, [0.0], [0.5], key=jax.random.key(0))
 
 
+def reached(q, loss, uncertainty):
+    """Polished configurations that are all free."""
+    uncertainty = np.full(q.shape, uncertainty)
+    return Polished(q=q, loss=loss, colored_loss=loss, cost=loss, uncertainty=uncertainty)
+
+
 def test_a_match_without_a_way_is_told(slider, monkeypatch):
     """What can be reached but does not match is no substitute for it."""
     world = vrrt_jax.build_world(slider, [beside(0.1)], engine="closed_form")
     start = np.array([-0.5], np.float32)
     q = np.array([[-0.4], [0.5]], np.float32)
     losses = np.array([2.0, 0.5])
-    polished = Polished(q=q, loss=losses, cost=losses, uncertainty=0.1 * np.ones((2, 1)))
+    polished = reached(q, losses, 0.1)
     monkeypatch.setattr(finish, "polish", lambda *_: polished)
     found = finished(trees.create(jnp.asarray(start[None]), jnp.ones(1), None, 8))
     config = PlannerConfig().changed(
@@ -97,13 +103,11 @@ def test_a_match_without_a_way_is_told(slider, monkeypatch):
     assert result.status is vrrt_jax.Status.NO_PATH and result.target == q[1]
     assert len(result.alternatives) == 0 and result.verification is None
     assert "move the obstacles" in result.advice
-    polished = Polished(q=q, loss=np.ones(2), cost=np.ones(2), uncertainty=np.ones((2, 1)))
+    polished = reached(q, np.ones(2), 1.0)
     result = finish.finish_visual(*args)
     assert result.ok and result.target == q[0] and result.joint_uncertainty == 1.0
     assert "may be off: slide by 1" in result.advice
-    polished = Polished(
-        q=q, loss=np.array([2.0, 0.5]), cost=np.full(2, np.inf), uncertainty=np.ones((2, 1))
-    )
+    polished = dataclasses.replace(reached(q, losses, 1.0), cost=np.full(2, np.inf))
     result = finish.finish_visual(*args)
     assert result.status is vrrt_jax.Status.NO_PATH and result.target == q[1]
     assert result.advice == "all that was found is in collision: move the obstacles"
@@ -114,9 +118,7 @@ def test_a_match_is_missed_before_a_way(slider, monkeypatch, time_limit_s):
     """Also where the time ran out on the way to what matches nothing."""
     world = vrrt_jax.build_world(slider, [beside(0.1)], engine="closed_form")
     q = np.array([[0.5]], np.float32)  # behind the obstacle
-    polished = Polished(
-        q=q, loss=np.array([2.0]), cost=np.array([2.0]), uncertainty=np.ones((1, 1))
-    )
+    polished = reached(q, np.array([2.0]), 1.0)
     monkeypatch.setattr(finish, "polish", lambda *_: polished)
     start = np.array([-0.5], np.float32)
     found = finished(trees.create(jnp.asarray(start[None]), jnp.ones(1), None, 8))
