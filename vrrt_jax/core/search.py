@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.compiling import host_jit
 from vrrt_jax.core.edges import Space
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.interrupt import interruptible
@@ -103,8 +104,8 @@ def initial_state(tree: Tree) -> SearchState:
     )
 
 
-_initial = jax.jit(initial_state)
-_initials = jax.jit(jax.vmap(initial_state))
+_initial = host_jit(initial_state)
+_initials = host_jit(jax.vmap(initial_state))
 
 
 def stop_reason(state: SearchState, termination: Termination) -> jax.Array:
@@ -155,8 +156,8 @@ def run_chunk(
     return state, stop_reason(state, termination)
 
 
-_chunk = jax.jit(run_chunk)
-_chunks = jax.jit(jax.vmap(run_chunk, in_axes=(None, 0, None, 0, 0, 0, None)))
+_chunk = host_jit(run_chunk)
+_chunks = host_jit(jax.vmap(run_chunk, in_axes=(None, 0, None, 0, 0, 0, None)))
 
 
 @single_precision

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.compiling import host_jit
 from vrrt_jax.core.edges import (
     Edge,
     Space,
@@ -56,7 +57,7 @@ def shortcut(
     return np.asarray(done.q)[: int(done.size)]
 
 
-@jax.jit
+@host_jit
 def _shortcut(world: Space, q, size, key, rounds, patience) -> _Path:
     state = _Path(q=q, size=size, idle=jnp.int32(0), round=jnp.int32(0))
     return jax.lax.while_loop(

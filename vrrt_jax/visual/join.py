@@ -9,6 +9,7 @@ import numpy as np
 
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core import tree as trees
+from vrrt_jax.core.compiling import host_jit
 from vrrt_jax.core.edges import first_free_edge, num_checks
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners import RRTConnect
@@ -66,7 +67,7 @@ def join(
     return found, Way(path=path, tree_share=1.0)
 
 
-@partial(jax.jit, static_argnames="num_steps")
+@partial(host_jit, static_argnames="num_steps")
 def cheapest_parent(
     world: World, tree: Tree, q_goal: jax.Array, num_steps: int
 ) -> tuple[jax.Array, jax.Array]:

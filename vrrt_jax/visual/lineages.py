@@ -19,6 +19,7 @@ import optax
 
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core import tree as trees
+from vrrt_jax.core.compiling import host_jit
 from vrrt_jax.core.edges import num_checks
 from vrrt_jax.core.types import Expansion, Goal, Proposals, Tree, pytree, static
 from vrrt_jax.scene.world import World
@@ -260,7 +261,7 @@ def steps_in_ball(key: jax.Array, num: int, joints: int, radius: Any) -> jax.Arr
     return radius * jax.random.uniform(key_length, (num, 1)) * direction
 
 
-@functools.partial(jax.jit, static_argnums=3)
+@functools.partial(host_jit, static_argnums=3)
 def tree_from_roots(world: World, goal: Goal, q: jax.Array, capacity: int) -> Tree[LineageNode]:
     """Roots ``q`` (R, D), the start first; the worst of scores for those in collision."""
     score = _losses(world, goal, q)

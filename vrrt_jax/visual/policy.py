@@ -15,6 +15,7 @@ import optax
 
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core import tree as trees
+from vrrt_jax.core.compiling import host_jit
 from vrrt_jax.core.edges import difference, num_checks
 from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.rewire import rewire
@@ -204,7 +205,7 @@ class VisualRRT:
         return trees.best_path(tree)
 
 
-@partial(jax.jit, static_argnums=3)
+@partial(host_jit, static_argnums=3)
 def tree_from_roots(world: World, goal: Goal, q: jax.Array, capacity: int) -> Tree[VisualNode]:
     """Roots ``q`` (R, D), the start first; those in collision are never expanded."""
     score, grad = losses_and_gradients(world, goal, q)

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.config import PolishConfig
+from vrrt_jax.core.compiling import host_jit
 from vrrt_jax.core.edges import difference, enforce_bounds, steps_between
 from vrrt_jax.core.parallel import map_on_threads
 from vrrt_jax.core.types import pytree
@@ -238,7 +239,7 @@ def _hand_goal(
     return goal, close_up.threshold * max(covered, LEAST_COVERED) / known
 
 
-@jax.jit
+@host_jit
 def _hand_px(world: World, splats: SplatModel, cameras: Camera, q: jax.Array) -> jax.Array:
     """Where (V, 2) the middle of the last link is in V views [px]."""
     last = splats.link == splats.link[-1]
@@ -289,7 +290,7 @@ def _in_batches(
     return [np.concatenate(column)[: len(q)] for column in zip(*found, strict=True)]
 
 
-@jax.jit
+@host_jit
 def evaluate_cost(world: World, goal: PriorGoal, q: jax.Array) -> tuple[jax.Array]:
     """The cost alone (n,), see :class:`_GaussNewtonModel`."""
     q = enforce_bounds(world, q)
@@ -298,7 +299,7 @@ def evaluate_cost(world: World, goal: PriorGoal, q: jax.Array) -> tuple[jax.Arra
     return (loss + goal.prior * jnp.sum(away**2, axis=1),)
 
 
-@jax.jit
+@host_jit
 def linearize(world: World, goal: PriorGoal, q: jax.Array) -> tuple[jax.Array, ...]:
     """Columns of a :class:`_GaussNewtonModel`; derivatives are finite differences."""
     joints = q.shape[1]
