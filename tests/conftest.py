@@ -2,9 +2,13 @@
 
 import ctypes
 import gc
+import os
 import resource
 import sys
 from pathlib import Path
+
+# Read when JAX is imported. What is not of the package's own `host_jit` compiles quicker so, too.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1")
 
 import jax
 import numpy as np

@@ -17,7 +17,7 @@ VRRT_ROOMS = (
     ("config", "checks", "outcome"),
     ("visual",),
     ("attempts", "joint"),
-    ("planner", "problems"),
+    ("planner", "pose", "problems"),
     ("report", "viz", "viewer"),
     ("bench",),
     ("cli",),

@@ -34,6 +34,7 @@ from vrrt_jax.motion.limits import MotionLimits, motion_limits  # noqa: E402
 from vrrt_jax.motion.simulate import Tracking, execute_in_sim  # noqa: E402
 from vrrt_jax.motion.trajectory import Trajectory, time_parameterize  # noqa: E402
 from vrrt_jax.planner import plan, plan_batch, plan_to_configuration  # noqa: E402
+from vrrt_jax.pose import inverse_kinematics, plan_to_pose  # noqa: E402
 from vrrt_jax.problems import Problem, load_problem, load_world, problem_names  # noqa: E402
 from vrrt_jax.robots import Robot, load_robot, robot_names  # noqa: E402
 from vrrt_jax.robots.kinematics import link_poses  # noqa: E402
@@ -106,6 +107,7 @@ __all__ = [
     "difference",
     "distance",
     "execute_in_sim",
+    "inverse_kinematics",
     "is_free",
     "link_poses",
     "load_problem",
@@ -122,6 +124,7 @@ __all__ = [
     "plan",
     "plan_batch",
     "plan_to_configuration",
+    "plan_to_pose",
     "problem_names",
     "pytree",
     "read_image",

@@ -90,7 +90,7 @@ def _attempt(
         chosen = _chosen(world, goal, q_start[None], q_start)
         result = finish(robot, world, no_search(policy, goal, tree), chosen, q_start, key, config)
         return dataclasses.replace(result, advice=JOINT_ADVICE[result.status])
-    wary = keeping_clearance(world, np.stack([q_start, goal.q]), config.path.margin)
+    wary = keeping_clearance(world, np.vstack([q_start, goal.q]), config.path.margin)
     limit = config.budget.max_iterations
     # A planner that goes on to improve gets all of its iterations with the clearance.
     improves = policy.goal_score(goal) == -np.inf
@@ -122,7 +122,7 @@ def _chosen(
     end = q_start if path is None else path[-1]
     return Chosen(
         path=path,
-        target=np.asarray(goal.q),
+        target=np.asarray(goal.nearest(world, jnp.asarray(end))),
         loss=float(goal.loss(world, jnp.asarray(end))),
         threshold=float(goal.threshold),
     )

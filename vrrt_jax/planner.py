@@ -13,7 +13,7 @@ from vrrt_jax.attempts import plan_batch_by_loss, plan_by_loss
 from vrrt_jax.config import PlannerConfig, check_config
 from vrrt_jax.core.check_protocols import check_goal, check_policy
 from vrrt_jax.core.goal import ConfigurationGoal
-from vrrt_jax.core.planners import PLANNERS, RRT, RRTStar
+from vrrt_jax.core.planners import PLANNERS, RRT, RRTConnect, RRTStar
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import PlanResult
 from vrrt_jax.core.types import ExpansionPolicy, Goal
@@ -122,8 +122,7 @@ def plan(
             raise ValueError("q_guess is for goals that are not known; drop it for a joint goal")
         roots = np.stack([start, checks.check_limits(robot, q_guess, "guess")])
     if isinstance(goal, ConfigurationGoal):
-        q_goal = checks.check_start(robot, world, goal.q, what="goal")
-        goal = dataclasses.replace(goal, q=jnp.asarray(q_goal))
+        goal = _checked_goal(robot, world, goal, policy)
         return plan_to_goal(robot, world, goal, policy, start, key, config, on_progress)
     problem = make_problem(robot, goal, start, config)
     return plan_by_loss(robot, world, problem, policy, roots, key, config, on_progress)
@@ -148,7 +147,7 @@ def plan_to_configuration(
         robot: from :func:`load_robot`.
         world: for this robot.
         q_start: (D,) [rad] or [m].
-        q_goal: (D,) [rad] or [m].
+        q_goal: (D,) [rad] or [m]; or (G, D), any of which will do, for "rrt-connect".
         key: random key.
         planner: see :func:`plan`.
         config: budget, capacity and lanes are used.
@@ -259,8 +258,7 @@ def plan_batch(
                 )
             starts.append(checks.check_start(robot, own, q_start))
             if isinstance(goal, ConfigurationGoal):
-                q_goal = checks.check_start(robot, own, goal.q, what="goal")
-                checked.append(dataclasses.replace(goal, q=jnp.asarray(q_goal)))
+                checked.append(_checked_goal(robot, own, goal, policy))
                 continue
             if not isinstance(goal, ImageGoal):
                 check_goal(goal)
@@ -300,6 +298,27 @@ def _policy(
     if not has_configuration:
         raise ValueError(_needs_configuration(planner, goal))
     return PLANNERS[planner].for_world(world, lanes=config.tree.lanes)
+
+
+def _checked_goal(
+    robot: Robot, world: World, goal: ConfigurationGoal, policy: ExpansionPolicy
+) -> ConfigurationGoal:
+    """A joint goal inside the limits and free.
+
+    Raises:
+        ValueError: it is not; or there are several, and the planner takes one.
+    """
+    if np.ndim(goal.q) < 2:
+        q = checks.check_start(robot, world, goal.q, what="goal")
+        return dataclasses.replace(goal, q=jnp.asarray(q))
+    if not isinstance(policy, RRTConnect):
+        raise ValueError(
+            f"{type(policy).__name__} takes one goal; expected q (D,), or planner 'rrt-connect'"
+        )
+    all_q = [checks.check_start(robot, world, q, what=f"goal {k}") for k, q in enumerate(goal.q)]
+    if not all_q:
+        raise ValueError("the goal is an empty list; expected one configuration (D,) at least")
+    return dataclasses.replace(goal, q=jnp.asarray(np.stack(all_q)))
 
 
 def _needs_configuration(planner: str, goal: AnyGoal) -> str:

@@ -135,6 +135,8 @@ def _check(benchmark: ArmBenchmark) -> None:
         value = getattr(benchmark, name)
         if value is not None and value < 1:
             raise ValueError(f"--{name} is {value}; expected at least 1")
+    if benchmark.batch is not None and benchmark.planner == arm_trials.POSE:
+        raise ValueError("--batch is for joint goals; drop it for --planner pose")
 
 
 def _check_done(scenes: Mapping[str, Any], problems: Sequence[ArmProblems]) -> None:

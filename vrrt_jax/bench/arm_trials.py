@@ -17,6 +17,8 @@ from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.interrupt import uninterrupted
 from vrrt_jax.core.shortcut import path_length
+from vrrt_jax.pose import plan_to_pose
+from vrrt_jax.robots.kinematics import batch_link_poses
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.attached import attach, detach, touching_spheres
 from vrrt_jax.scene.exact import exact_scene
@@ -24,6 +26,7 @@ from vrrt_jax.scene.obstacles import Obstacle
 from vrrt_jax.scene.verify import contacts
 from vrrt_jax.scene.world import World, batch_is_free, with_obstacles
 
+POSE = "pose"  # the name of plan_to_pose among planners
 LARGEST_HELD = 0.3  # [m] edge or length of what a hand can hold
 _COMPILED = "/jax/core/compile/backend_compile_duration"  # jax.monitoring's name of a compilation
 
@@ -151,7 +154,7 @@ def solve(
     Args:
         robot: from :func:`vrrt_jax.load_robot`.
         trial: what to plan.
-        planner_name: see :func:`vrrt_jax.plan`.
+        planner_name: see :func:`vrrt_jax.plan`; or "pose", to where the last link is at the goal.
         config: settings.
         seed: of the benchmark.
 
@@ -166,18 +169,18 @@ def solve(
 
     def plan():
         started = time.perf_counter()
+        key = jax.random.fold_in(jax.random.key(seed), trial.index)
+        own: dict[str, Any] = {"key": key, "config": config}
         with uninterrupted():
-            result = planner.plan(
-                robot,
-                trial.world,
-                ConfigurationGoal(q=trial.q_goal),
-                trial.q_start,
-                key=jax.random.fold_in(jax.random.key(seed), trial.index),
-                planner=planner_name,
-                config=config,
-            )
+            if planner_name == POSE:
+                result = plan_to_pose(robot, trial.world, trial.q_start, pose, **own)
+            else:
+                goal = ConfigurationGoal(q=trial.q_goal)
+                own["planner"] = planner_name
+                result = planner.plan(robot, trial.world, goal, trial.q_start, **own)
         return result, 1e3 * (time.perf_counter() - started)
 
+    pose = np.asarray(batch_link_poses(trial.world.chain, trial.q_goal[None]))[0, -1]
     before = _compilations()[0]
     result, wall_ms = plan()
     recompiled = _compilations()[0] > before

@@ -119,7 +119,11 @@ def _add_arm(parser: argparse.ArgumentParser) -> None:
         type=_base,
         help="where the robot's base link stands in the files, as --base=x,y,z,yaw [m, rad]",
     )
-    parser.add_argument("--planner", default="rrt-connect", help="rrt-connect, rrt or rrt-star")
+    parser.add_argument(
+        "--planner",
+        default="rrt-connect",
+        help="rrt-connect, rrt or rrt-star; or pose: to where the last link is at the goal",
+    )
     _add_engine(parser)
     parser.add_argument(
         "--limit", type=command.whole(1, 1_000_000), help="problems of each file, evenly taken"

@@ -14,23 +14,30 @@ REACHED = 1e-4  # [rad] a path that ends this near to a joint goal ends there
 
 @pytree
 class ConfigurationGoal:
-    """A joint goal. The loss is the length of the edge to it."""
+    """A joint goal, or any of G. The loss is the length of the edge to the nearest."""
 
-    q: Any  # (D,) [rad] or [m]
+    q: Any  # (D,) or (G, D) [rad] or [m]
     threshold: Any = REACHED  # () [rad]
 
     def loss(self, world: Any, q: jax.Array) -> jax.Array:
         """Distance () of a configuration (D,)."""
-        return world.distance(q, self.q)
+        if jnp.ndim(self.q) == 1:
+            return world.distance(q, self.q)
+        return jnp.min(jax.vmap(world.distance, (None, 0))(q, jnp.asarray(self.q)))
 
     def residual(self, world: Any, q: jax.Array) -> jax.Array:
-        """Step (D,) from the goal to a configuration (D,)."""
-        return difference(world, self.q, q)
+        """Step (D,) from the nearest goal to a configuration (D,)."""
+        return difference(world, self.nearest(world, q), q)
+
+    def nearest(self, world: Any, q: jax.Array) -> jax.Array:
+        """The goal (D,) that is nearest to a configuration (D,)."""
+        goals = jnp.atleast_2d(jnp.asarray(self.q))
+        return goals[jnp.argmin(jax.vmap(world.distance, (None, 0))(q, goals))]
 
 
 def starts_at(goal: ConfigurationGoal, world: Any, q_start: Any) -> bool:
     """Whether a plan that starts at ``q_start`` (D,) is at its goal; on the host."""
-    far = float(world.distance(jnp.asarray(q_start), jnp.asarray(goal.q)))
+    far = float(goal.loss(world, jnp.asarray(q_start)))
     return far <= min(float(goal.threshold), REACHED)
 
 

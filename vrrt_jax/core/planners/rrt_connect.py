@@ -59,20 +59,21 @@ class RRTConnect:
     def init(
         self, world: Space, goal: ConfigurationGoal, q_roots: Any, capacity: int
     ) -> Tree[ConnectNode]:
-        """The start is node 0 and the goal node 1; other roots are not used.
+        """The start is node 0, and the G goals are the next; other roots are not used.
 
         Raises:
             ValueError: there is no lane left to connect the trees.
         """
         if self.lanes < 2:
             raise ValueError(f"RRT-Connect has {self.lanes} lanes; expected 2 or more")
+        q = np.vstack([np.asarray(q_roots)[0], np.asarray(goal.q)]).astype(np.float32)
+        num = len(q)
         ends: dict[str, Any] = {
-            "side": np.array([0, 1], np.int32),
-            "fresh": np.array([True, True]),
-            "meets": np.array([-1, -1], np.int32),
+            "side": np.minimum(np.arange(num), 1).astype(np.int32),
+            "fresh": np.full(num, True),
+            "meets": np.full(num, -1, np.int32),
         }
-        q = np.stack([np.asarray(q_roots)[0], np.asarray(goal.q)]).astype(np.float32)
-        far = np.full(2, np.finfo(np.float32).max)
+        far = np.full(num, np.finfo(np.float32).max)
         return trees.create(q, far, ConnectNode(**ends), capacity)
 
     def init_from(
@@ -130,8 +131,8 @@ class RRTConnect:
         connects = jnp.concatenate([jnp.zeros(half, bool), newest >= 0])
         chosen = jnp.concatenate([jnp.zeros(half, jnp.int32), newest])
 
-        # The others extend towards samples. Half of the samples are near the two ends: where
-        # limits are far apart, few others serve.
+        # The others extend towards samples. Half of the samples are near the start and the first
+        # goal: where limits are far apart, few others serve.
         q_start, q_goal = world.normalize(tree.q[:2])
         ends = jnp.stack([q_start, world.end(q_start, world.edge(q_start, q_goal))])
         lower = jnp.maximum(world.lower, jnp.min(ends, axis=0) - self.margin)
