@@ -19,6 +19,7 @@ from vrrt_jax.joint import plan_to_goal
 from vrrt_jax.outcome import Chosen, Progress, finish
 from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.robots.robot import Robot
+from vrrt_jax.scene.verify import contacts
 from vrrt_jax.scene.world import World, keeping_clearance
 from vrrt_jax.visual.distinct import distances_to, distinct
 
@@ -93,11 +94,15 @@ def inverse_kinematics(
             nearest, least = q[np.argmin(away)], np.min(away)
             missed = f"{meters[np.argmin(away)]:.3g} m and {radians[np.argmin(away)]:.3g} rad"
     name = robot.link_names[index]
+    if not reached:
+        told = f"'{name}' stays {missed} from the pose; move it to where the arm reaches"
+        raise Unreached(told, nearest)
+    touching = contacts(robot, world, nearest) or contacts(
+        robot, world, nearest, geometry="spheres"
+    )
     raise Unreached(
-        f"all {reached} configurations that take '{name}' there are in collision; move the "
-        "obstacles or the pose"
-        if reached
-        else f"'{name}' stays {missed} from the pose; move it to where the arm reaches",
+        f"all {reached} configurations that take '{name}' there are in collision, one of them: "
+        f"{'; '.join(touching[:4]) or 'within the margin'}; move the obstacles or the pose",
         nearest,
     )
 

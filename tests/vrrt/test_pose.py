@@ -68,7 +68,8 @@ def test_where_nothing_reaches_it_says_why(posts):
     )
     world = vrrt_jax.build_world(robot, [solid], engine="closed_form")
     result = vrrt_jax.plan_to_pose(robot, world, posts.q_start, pose, key=KEY)
-    assert result.status is vrrt_jax.Status.NO_MATCH and "in collision" in result.advice
+    assert result.status is vrrt_jax.Status.NO_MATCH
+    assert "in collision" in result.advice and "touches solid" in result.advice
     with pytest.raises(ValueError, match="in collision"):
         vrrt_jax.inverse_kinematics(robot, world, pose, key=KEY)
 
