@@ -18,7 +18,7 @@ VRRT_ROOMS = (
     ("visual",),
     ("attempts", "joint"),
     ("planner", "pose", "problems"),
-    ("report", "viz", "viewer"),
+    ("report", "viz", "viewer", "doctor"),
     ("bench",),
     ("cli",),
 )

@@ -1,4 +1,4 @@
-"""The ``vrrt`` command: plan, view, render, fit, spheres, bench, report, worlds."""
+"""The ``vrrt`` command: plan, view, render, fit, spheres, bench, report, worlds, doctor."""
 
 import argparse
 import json
@@ -117,6 +117,9 @@ def _parser() -> argparse.ArgumentParser:
     worlds.add_argument("--num", type=command.whole(1, 100_000), default=6, help="worlds")
     worlds.add_argument("--seed", type=command.seed, default=0, help="before the first world's")
     worlds.add_argument("--out", required=True, help="folder for ROBOT_1.xml and so on")
+
+    doctor = commands.add_parser("doctor", help="say what this machine has, and what it lacks")
+    doctor.set_defaults(run=_doctor)
     return parser
 
 
@@ -171,6 +174,14 @@ def _view(arguments: argparse.Namespace) -> int:
     from vrrt_jax.viewer import view_folder
 
     view_folder(Path(arguments.folder), port=arguments.port).serve()
+    return EXIT_SOLVED
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from vrrt_jax.doctor import findings
+
+    for name, told in findings():
+        print(f"{name:18} {told}", flush=True)
     return EXIT_SOLVED
 
 
