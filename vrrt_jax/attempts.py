@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.config import PlannerConfig
+from vrrt_jax.core.compiling import compile_beside
 from vrrt_jax.core.edges import enforce_bounds
 from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.result import ABORTED, PlanResult, Status, with_time_of
-from vrrt_jax.core.search import make_termination, search
+from vrrt_jax.core.search import compile_search, make_termination, search
+from vrrt_jax.core.shortcut import shortcut
 from vrrt_jax.core.timing import timed
-from vrrt_jax.core.types import ExpansionPolicy, Goal
+from vrrt_jax.core.types import ExpansionPolicy, Goal, Tree
 from vrrt_jax.outcome import Progress, time_left
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.world import World, batch_is_free
@@ -22,6 +24,7 @@ from vrrt_jax.visual import lineages
 from vrrt_jax.visual import policy as published
 from vrrt_jax.visual.finish import finish_visual
 from vrrt_jax.visual.lineages import LineageRRT
+from vrrt_jax.visual.polish import Polishing, compile_polishing, linearize
 from vrrt_jax.visual.problem import VisualProblem
 
 ATTEMPT_KEY = 0x7FFFFFFF  # folded into the key of a later attempt; iterations count from 0
@@ -95,18 +98,28 @@ def attempt(
     on_progress: Progress,
 ) -> PlanResult:
     """Search from the start (the first of the roots), and finish, once."""
+    goal, termination = problem.goal, termination_of(config, policy, problem.goal)
+
+    def prepare() -> Tree:
+        tree = policy.init(world, goal, roots, config.tree.capacity)
+        compile_search(world, goal, policy, tree, key=key, termination=termination)
+        return tree
+
+    polishing = problem.polishing
+    kind = world, goal, policy, None if polishing is None else polishing.arrays
     tree, compile_s, _ = timed(
-        lambda: policy.init(world, problem.goal, roots, config.tree.capacity),
+        lambda: compile_beside(prepare, lambda: _compile_end(world, polishing, roots[0]), kind),
         lineages.tree_from_roots,
         published.tree_from_roots,
+        linearize,
     )
     found = search(
         world,
-        problem.goal,
+        goal,
         policy,
         tree,
         key=key,
-        termination=termination_of(config, policy, problem.goal),
+        termination=termination,
         time_limit_s=config.budget.time_limit_s,
         max_capacity=config.tree.max_capacity,
         copies=config.lineages.trees if isinstance(policy, LineageRRT) else 1,
@@ -114,6 +127,13 @@ def attempt(
     )
     found = dataclasses.replace(found, compile_s=found.compile_s + compile_s)
     return finish_visual(robot, world, problem, policy, found, roots[0], key, config)
+
+
+def _compile_end(world: World, polishing: Polishing | None, q: np.ndarray) -> None:
+    """Compile most of what follows the search."""
+    if polishing is not None:
+        compile_polishing(world, polishing)
+    shortcut(world, np.stack([q, q, q]), key=jax.random.key(0), rounds=0)
 
 
 def termination_of(config: PlannerConfig, policy: ExpansionPolicy, goal: Goal) -> Any:

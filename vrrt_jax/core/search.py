@@ -160,6 +160,19 @@ _chunk = host_jit(run_chunk)
 _chunks = host_jit(jax.vmap(run_chunk, in_axes=(None, 0, None, 0, 0, 0, None)))
 
 
+def compile_search(
+    world: Space,
+    goal: Any,
+    policy: ExpansionPolicy,
+    tree: Tree,
+    *,
+    key: jax.Array,
+    termination: Termination,
+) -> None:
+    """Compile what :func:`search` runs, by a search of no iterations."""
+    _compile(partial(_chunk, world, goal, policy), _initial(tree), termination, key)
+
+
 @single_precision
 def search(
     world: Space,

@@ -67,6 +67,12 @@ class Polishing:
     config: PolishConfig
 
     @property
+    def arrays(self) -> Any:
+        """A pytree of all that programs see of it."""
+        close_up = self.close_up
+        return self.coarse, self.fine, None if close_up is None else close_up.objective
+
+    @property
     def threshold(self) -> float:
         """Loss of a match on the fine image."""
         return float(self.fine.goal.threshold)
@@ -147,6 +153,17 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
         cost=np.where(kept.free, kept.cost, np.inf),
         uncertainty=joint_uncertainty(informed, polishing.threshold),
     )
+
+
+def compile_polishing(world: World, polishing: Polishing) -> None:
+    """Run every program of :func:`polish` once, at the start."""
+    q = np.asarray(polishing.fine.q_start)[None]
+    for goal in (polishing.coarse, polishing.fine):
+        _in_batches(evaluate_cost, world, goal, q, EVALUATE_BATCH)
+        _linearize(world, goal, q)
+    if polishing.close_up is not None:
+        near = _hand_goal(world, polishing.fine, polishing.close_up, q[0])[0]
+        _linearize(world, near, q, CLOSE_UP_BATCH)
 
 
 def _with_twins(
