@@ -43,6 +43,8 @@ RIDGE = 1e-7  # keeps joints that no pixel sees where they are
 MAX_STEP = 0.3  # [rad] of one step of a joint
 LATE_SAMPLES = 4  # times as many, where nothing matches
 TWINNED = 2  # best ends whose kinematic twins are looked at
+PAYS = 0.01  # share of the cost; steps that save less are idle
+IDLE_STEPS = 2  # in a row, after which a configuration is left
 TURNS = 12  # in which the last joint goes all the way round
 SPREAD_DECAY = 0.5  # how far samples spread in a round, in units of the round before
 LEAST_COVERED = 0.01  # share of a close-up; a hand that is hidden tells nothing
@@ -88,6 +90,10 @@ class _GaussNewtonModel(NamedTuple):
     slope: np.ndarray  # (n, D) half of its first
     free: np.ndarray  # (n,) bool
 
+    def take(self, rows: Any) -> "_GaussNewtonModel":
+        """The same of some configurations."""
+        return _GaussNewtonModel(*(column[rows] for column in self))
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Polished:
@@ -124,7 +130,7 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
             samples = np.concatenate([around, redraw_outer(world, q, num, rng)])
         cost = _in_batches(evaluate_cost, world, coarse, samples, EVALUATE_BATCH)[0]
         best = samples[np.argsort(cost, kind="stable")[:lanes]]
-        ends = _descend(lambda q: _linearize(world, coarse, q), best, config.steps)
+        ends = _descend(lambda q, _: _linearize(world, coarse, q), best, config.steps)
         kept = _distinct_ends(world, ends, config.kept)
         q = kept.q
         matched = np.any(kept.free & (kept.cost <= float(coarse.goal.threshold)))
@@ -133,7 +139,7 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
 
     # The fine image, from every minimum over a whole turn of the last joint.
     turned = _turns_oflast_hinge(world, fine, q, config.kept)
-    ends = _descend(lambda q: _linearize(world, fine, q), turned, config.steps)
+    ends = _descend(lambda q, _: _linearize(world, fine, q), turned, config.steps)
     kept = _with_twins(world, fine, _distinct_ends(world, ends, config.kept), config)
 
     # The close-up of the hand, together with the fine image.
@@ -173,7 +179,7 @@ def _with_twins(
     others = twins(world, ends.q[:TWINNED])
     if not len(others):
         return ends
-    found = _descend(lambda q: _linearize(world, goal, q), others, config.steps)
+    found = _descend(lambda q, _: _linearize(world, goal, q), others, config.steps)
     both = [np.concatenate(columns) for columns in zip(ends, found, strict=True)]
     return _distinct_ends(world, _GaussNewtonModel(*both), config.kept)
 
@@ -199,7 +205,7 @@ def joint_uncertainty(matrix: np.ndarray, threshold: float) -> np.ndarray:
 def _distinct_ends(world: World, model: _GaussNewtonModel, num: int) -> _GaussNewtonModel:
     """At most num, the free ones first and by rising cost; of near ones only the first."""
     rows = distinct(world, model.q, np.lexsort([model.cost, ~model.free]), num)
-    return _GaussNewtonModel(*(column[rows] for column in model))
+    return model.take(rows)
 
 
 def _turns_oflast_hinge(world: World, goal: PriorGoal, q: np.ndarray, num: int) -> np.ndarray:
@@ -228,14 +234,14 @@ def _descend_close_up(
     goal, threshold = _hand_goal(world, polishing.fine, close_up, ends.q[0])
     weight = polishing.threshold / threshold
 
-    def linearize_both(q: np.ndarray) -> _GaussNewtonModel:
-        near = _linearize(world, goal, q, CLOSE_UP_BATCH)
-        step = steps_between(world, ends.q, near.q)
-        bent = np.einsum("nij,nj->ni", ends.matrix, step)
+    def linearize_both(q: np.ndarray, rows: np.ndarray) -> _GaussNewtonModel:
+        near, own = _linearize(world, goal, q, CLOSE_UP_BATCH), ends.take(rows)
+        step = steps_between(world, own.q, near.q)
+        bent = np.einsum("nij,nj->ni", own.matrix, step)
         return near._replace(
-            cost=ends.cost + np.sum(step * (bent + 2 * ends.slope), axis=1) + weight * near.loss,
-            matrix=ends.matrix + weight * near.matrix,
-            slope=ends.slope + bent + weight * near.slope,
+            cost=own.cost + np.sum(step * (bent + 2 * own.slope), axis=1) + weight * near.loss,
+            matrix=own.matrix + weight * near.matrix,
+            slope=own.slope + bent + weight * near.slope,
         )
 
     return _descend(linearize_both, ends.q, polishing.config.steps)
@@ -266,27 +272,36 @@ def _hand_px(world: World, splats: SplatModel, cameras: Camera, q: jax.Array) ->
 
 
 def _descend(
-    linearize: Callable[[np.ndarray], _GaussNewtonModel], q: np.ndarray, steps: int
+    linearize: Callable[[np.ndarray, np.ndarray], _GaussNewtonModel], q: np.ndarray, steps: int
 ) -> _GaussNewtonModel:
-    """Levenberg-Marquardt: steps that lower the cost; those that do not raise the damping."""
-    now = linearize(q)
-    damping = np.full(len(now.q), 1e-3)
+    """Levenberg-Marquardt: steps that lower the cost; those that do not raise the damping.
+
+    A configuration whose steps hardly pay any more is left where it is.
+
+    Args:
+        linearize: the model around some of the configurations, given these and their indices.
+        q: (n, D) where from.
+        steps: at most so many.
+    """
+    now = linearize(q, np.arange(len(q)))
+    damping, idle = np.full(len(now.q), 1e-3), np.zeros(len(now.q), int)
     for _ in range(steps):
-        # Solve the damped normal equations of every configuration.
-        diagonal = np.einsum("nii->ni", now.matrix)
-        ridge = damping[:, None] * diagonal + RIDGE
-        matrix = now.matrix + ridge[:, :, None] * np.eye(now.q.shape[1])
-        change = -np.linalg.solve(matrix, now.slope[..., None])[..., 0]
-        tried = linearize(now.q + np.clip(change, -MAX_STEP, MAX_STEP))
+        rows = np.flatnonzero(idle < IDLE_STEPS)
+        if not len(rows):
+            break
+        # Solve the damped normal equations of every configuration that goes on.
+        old = now.take(rows)
+        diagonal = np.einsum("nii->ni", old.matrix)
+        ridge = damping[rows, None] * diagonal + RIDGE
+        matrix = old.matrix + ridge[:, :, None] * np.eye(now.q.shape[1])
+        change = -np.linalg.solve(matrix, old.slope[..., None])[..., 0]
+        tried = linearize(old.q + np.clip(change, -MAX_STEP, MAX_STEP), rows)
         # Take what is better; elsewhere go on from where it was, with shorter steps.
-        better = tried.cost < now.cost
-        damping *= np.where(better, 0.3, 4.0)
-        now = _GaussNewtonModel(
-            *(
-                np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-                for new, old in zip(tried, now, strict=True)
-            )
-        )
+        better = tried.cost < old.cost
+        damping[rows] *= np.where(better, 0.3, 4.0)
+        idle[rows] = np.where(tried.cost < (1 - PAYS) * old.cost, 0, idle[rows] + 1)
+        for column, new in zip(now, tried, strict=True):
+            column[rows[better]] = new[better]
     return now
 
 
