@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import jax
+import mujoco
 
 from vrrt_jax.core.timing import machine, versions
 from vrrt_jax.robots import load_robot, robot_names
@@ -39,8 +40,6 @@ def _opengl() -> str:
     """Whether MuJoCo draws, with which backend."""
     backend = os.environ.get("MUJOCO_GL", "the system's")
     try:
-        import mujoco
-
         model = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
         with mujoco.Renderer(model, 16, 16) as renderer:
             renderer.update_scene(mujoco.MjData(model))

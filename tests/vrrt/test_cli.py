@@ -195,3 +195,14 @@ def test_self_models_come_back(tmp_path):
     assert [level.size_px for level in packed.levels] == [32, 64, 128, 256]
     assert packed.level_for(40).size_px == 64 and packed.level_for(900).size_px == 256
     assert packed.level_for(64).psnr_db >= 35 and packed.level_for(256).psnr_db >= 30
+
+
+def test_the_doctor_says_what_there_is(capsys, monkeypatch):
+    assert cli.main(["doctor"]) == 0
+    told = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert told["OpenGL"].endswith("draws") and "jax" in told["versions"]
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("vrrt_jax.doctor.mesh_spec", lambda *_, **__: None)
+    assert cli.main(["doctor"]) == 0
+    told = capsys.readouterr().out
+    assert 'pip install "vrrt-jax[view]"' in told and "gymnasium-robotics" in told
