@@ -75,7 +75,7 @@ def check_tree(world, tree):
 
 
 @pytest.mark.light_compilation
-@pytest.mark.parametrize("method", ["bit-star", "nrp-star-d"])  # the two kinds
+@pytest.mark.parametrize("method", STARS)
 def test_the_budget_is_used_and_paths_never_get_longer(solve, world, method):
     # An iteration of BIT* costs a fraction of the others', so that it has time to improve.
     budget = 9600 if method == "bit-star" else 3200
