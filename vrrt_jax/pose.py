@@ -14,6 +14,7 @@ from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners import RRTConnect
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import PlanResult, Status
+from vrrt_jax.core.rigid import rigid
 from vrrt_jax.core.search import no_search
 from vrrt_jax.joint import plan_to_goal
 from vrrt_jax.outcome import Chosen, Progress, finish
@@ -74,14 +75,14 @@ def inverse_kinematics(
         Unreached: there is none; a ValueError that says how near the link gets, or that all are in
             collision.
     """
-    index, pose = _link_index(robot, link), _check_pose(pose)
+    index, target = _link_index(robot, link), jnp.asarray(rigid(pose, "the pose"), jnp.float32)
     q_near = robot.home if q_near is None else checks.check_limits(robot, q_near, "q_near")
     nearest, least = q_near, np.inf
     reached = 0
     for k in range(ROUNDS):
         places = _places(world, jnp.asarray(q_near), jax.random.fold_in(key, k), k == 0)
         q, meters, radians, free = (
-            np.asarray(a) for a in _descend(world, jnp.asarray(pose), jnp.int32(index), places)
+            np.asarray(a) for a in _descend(world, target, jnp.int32(index), places)
         )
         there = (meters <= REACHED_M) & (radians <= REACHED_RAD)
         reached += int(np.sum(there))
@@ -228,22 +229,3 @@ def _link_index(robot: Robot, link: str | None) -> int:
     if link not in robot.link_names:
         raise ValueError(f"unknown link '{link}'; have: {', '.join(robot.link_names)}")
     return robot.link_names.index(link)
-
-
-def _check_pose(pose: np.ndarray) -> np.ndarray:
-    """A rigid transform (4, 4) in float32.
-
-    Raises:
-        ValueError: it is none.
-    """
-    pose = np.asarray(pose, float)
-    if pose.shape != (4, 4):
-        raise ValueError(f"the pose has shape {pose.shape}; expected (4, 4), link to world")
-    turn = pose[:3, :3]
-    is_rigid = np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) and np.linalg.det(turn) > 0
-    if not np.all(np.isfinite(pose)) or not is_rigid or not np.allclose(pose[3], [0, 0, 0, 1]):
-        raise ValueError(
-            "the pose is not a rigid transform; expected a rotation, a translation in its last "
-            "column, and 0 0 0 1 in its last row"
-        )
-    return pose.astype(np.float32)

@@ -77,9 +77,9 @@ def test_where_nothing_reaches_it_says_why(posts):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"pose": np.eye(3)}, r"shape \(3, 3\); expected \(4, 4\)"),
-        ({"pose": np.diag([1.0, 1.0, -1.0, 1.0])}, "not a rigid transform"),
-        ({"pose": np.full((4, 4), np.nan)}, "not a rigid transform"),
+        ({"pose": np.eye(3)}, r"the pose has shape \(3, 3\); expected a rigid \(4, 4\)"),
+        ({"pose": np.diag([1.0, 1.0, -1.0, 1.0])}, r"the pose is not a rigid \(4, 4\) transform"),
+        ({"pose": np.full((4, 4), np.nan)}, r"the pose is not a rigid \(4, 4\) transform"),
         ({"link": "hand2"}, "unknown link 'hand2'; have: .*link7"),
     ],
 )

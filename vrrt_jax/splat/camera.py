@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.precision import single_precision
+from vrrt_jax.core.rigid import rigid
 from vrrt_jax.splat.types import Camera
 
 # Of the vertical field of view [degree]. Less is an angle in radians, more a focal length in mm.
 MIN_FOVY_DEG, MAX_FOVY_DEG = 4.0, 150.0
 MAX_ASPECT = 2.0  # ratio of the two focal lengths
 MAX_DISTANCE_M = 100.0  # from the world's origin; farther ones are in mm
-NOT_A_ROTATION = 3e-3  # how far a rotation is off if it is written with three decimals
 USUAL_CENTRE = 0.1, 0.9  # in units of the image; elsewhere it may be of another image
 
 
@@ -96,7 +96,13 @@ def camera_from_matrix(
         ValueError: the matrix is not rigid, or a value is not finite, of another length or out of
             range.
     """
-    world_to_cam = _rigid(world_to_cam)
+    world_to_cam = rigid(world_to_cam, "world_to_cam")
+    distance = np.linalg.norm(world_to_cam[:3, 3])
+    if distance > MAX_DISTANCE_M:
+        raise ValueError(
+            f"the camera is {distance:.0f} m away from the world's origin; expected at most "
+            f"{MAX_DISTANCE_M:g}: give positions in meters, not in mm"
+        )
     height, width = _size(height, "height"), _size(width, "width")
     is_pair = np.ndim(focal) == 1
     fx, fy = _vector(focal, 2, "focal") if is_pair else [_number(focal, "focal")] * 2
@@ -134,52 +140,6 @@ def camera_from_matrix(
         width=width,
         aspect=float(fx / fy),
     )
-
-
-def _rigid(world_to_cam: np.ndarray) -> np.ndarray:
-    """The transform (4, 4) in float64.
-
-    Raises:
-        ValueError: it is not rigid, or its translation can hardly be in meters.
-    """
-    try:
-        matrix = np.asarray(world_to_cam, np.float64)
-    except (TypeError, ValueError):
-        raise ValueError("world_to_cam is not made of numbers; expected 4 rows of 4") from None
-    if matrix.shape != (4, 4):
-        raise ValueError(
-            f"world_to_cam has shape {matrix.shape}; expected a rigid (4, 4) transform, 4 rows of 4"
-        )
-    last_row = [0.0, 0.0, 0.0, 1.0]
-    if not np.allclose(matrix[3], last_row, rtol=0, atol=1e-6):
-        is_transposed = np.allclose(matrix[:, 3], last_row, rtol=0, atol=1e-6)
-        raise ValueError(
-            f"world_to_cam is not a rigid (4, 4) transform: its last row is {matrix[3].tolist()}; "
-            f"expected 0 0 0 1{': transpose the matrix' if is_transposed else ''}"
-        )
-    rotation = matrix[:3, :3]
-    if (
-        not np.all(np.isfinite(matrix))
-        or not np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=NOT_A_ROTATION)
-        or np.linalg.det(rotation) < 0
-    ):
-        raise ValueError(
-            "world_to_cam is not a rigid (4, 4) transform; its upper left 3 x 3 block must be a "
-            "rotation, and all of it finite"
-        )
-    distance = np.linalg.norm(matrix[:3, 3])
-    if distance > MAX_DISTANCE_M:
-        raise ValueError(
-            f"the camera is {distance:.0f} m away from the world's origin; expected at most "
-            f"{MAX_DISTANCE_M:g}: give positions in meters, not in mm"
-        )
-    if np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-5):
-        return matrix
-    # What few decimals have bent is straightened: the nearest rotation.
-    left, _, right = np.linalg.svd(rotation)
-    straight = matrix.copy()
-    straight[:3, :3] = left @ right
-    return straight
 
 
 def _vector(values: Any, length: int, what: str) -> np.ndarray:
