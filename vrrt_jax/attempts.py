@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.config import PlannerConfig
-from vrrt_jax.core.compiling import compile_beside
+from vrrt_jax.core.compiling import compile_together
 from vrrt_jax.core.edges import enforce_bounds
 from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.result import ABORTED, PlanResult, Status, with_time_of
@@ -24,7 +24,7 @@ from vrrt_jax.visual import lineages
 from vrrt_jax.visual import policy as published
 from vrrt_jax.visual.finish import finish_visual
 from vrrt_jax.visual.lineages import LineageRRT
-from vrrt_jax.visual.polish import Polishing, compile_polishing, linearize
+from vrrt_jax.visual.polish import compile_polishing, linearize
 from vrrt_jax.visual.problem import VisualProblem
 
 ATTEMPT_KEY = 0x7FFFFFFF  # folded into the key of a later attempt; iterations count from 0
@@ -100,15 +100,25 @@ def attempt(
     """Search from the start (the first of the roots), and finish, once."""
     goal, termination = problem.goal, termination_of(config, policy, problem.goal)
 
-    def prepare() -> Tree:
-        tree = policy.init(world, goal, roots, config.tree.capacity)
-        compile_search(world, goal, policy, tree, key=key, termination=termination)
-        return tree
+    def init() -> Tree:
+        return policy.init(world, goal, roots, config.tree.capacity)
 
-    polishing = problem.polishing
-    kind = world, goal, policy, None if polishing is None else polishing.arrays
+    def compile_start() -> None:
+        compile_search(world, goal, policy, init(), key=key, termination=termination)
+
+    def compile_end() -> None:
+        if problem.polishing is not None:
+            compile_polishing(world, problem.polishing)
+        shortcut(world, np.repeat(roots[:1], 3, axis=0), key=key, rounds=0)
+
+    def prepare() -> Tree:
+        polished = None if problem.polishing is None else problem.polishing.arrays
+        kind = world, goal, policy, polished, roots
+        compile_together(kind, compile_start, compile_end)
+        return init()
+
     tree, compile_s, _ = timed(
-        lambda: compile_beside(prepare, lambda: _compile_end(world, polishing, roots[0]), kind),
+        prepare,
         lineages.tree_from_roots,
         published.tree_from_roots,
         linearize,
@@ -127,13 +137,6 @@ def attempt(
     )
     found = dataclasses.replace(found, compile_s=found.compile_s + compile_s)
     return finish_visual(robot, world, problem, policy, found, roots[0], key, config)
-
-
-def _compile_end(world: World, polishing: Polishing | None, q: np.ndarray) -> None:
-    """Compile most of what follows the search."""
-    if polishing is not None:
-        compile_polishing(world, polishing)
-    shortcut(world, np.stack([q, q, q]), key=jax.random.key(0), rounds=0)
 
 
 def termination_of(config: PlannerConfig, policy: ExpansionPolicy, goal: Goal) -> Any:

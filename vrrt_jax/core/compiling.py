@@ -3,15 +3,13 @@
 import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.precision import single_precision
-
-Output = TypeVar("Output")
 
 # On two cores (jaxlib 0.10) the first visual plan took 43 s by default and 28 s so, and the
 # second plan 3.9 s and 3.5 s. At level 0 of LLVM's optimizer programs run five times as slow. The
@@ -21,24 +19,21 @@ QUICK_TO_COMPILE = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emi
 # Not for what someone may call inside of a ``jax.jit`` of their own: JAX refuses options there.
 host_jit = functools.partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
 
-_seen: set[Any] = set()  # the kinds that compile_beside has been called with
+_seen: set[Any] = set()  # the kinds that compile_together has been called with
 
 
-def compile_beside(run: Callable[[], Output], warm_up: Callable[[], Any], kind: Any) -> Output:
-    """The result of a run that compiles, while a thread compiles what comes after it.
+def compile_together(kind: Any, *warm_ups: Callable[[], Any]) -> None:
+    """Compile programs at the same time, unless it was done before.
 
     Args:
-        run: what to do meanwhile.
-        warm_up: calls the programs that come after.
         kind: a pytree; what has the same structure and shapes needs no new programs.
+        warm_ups: each calls some of the programs, on a thread of its own.
     """
     leaves, structure = jax.tree.flatten(kind)
     shapes = structure, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
     if shapes in _seen:
-        return run()
-    with ThreadPoolExecutor(1) as pool:
-        ahead = pool.submit(single_precision(warm_up))
-        output = run()
-        ahead.result()
+        return
+    with ThreadPoolExecutor(len(warm_ups)) as pool:
+        for done in [pool.submit(single_precision(warm_up)) for warm_up in warm_ups]:
+            done.result()
     _seen.add(shapes)
-    return output

@@ -1,35 +1,35 @@
-"""Programs that compile while others do."""
+"""Programs that compile together."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vrrt_jax.core.compiling import compile_beside, host_jit
+from vrrt_jax.core.compiling import compile_together, host_jit
 
 
-def test_what_comes_after_is_compiled_once_for_a_kind():
+def test_programs_are_compiled_once_for_a_kind():
     called = []
-    kind = {"q": np.zeros((3, 11))}
+    warm_ups = [lambda: called.append("start"), lambda: called.append("end")]
     for _ in range(2):
-        assert compile_beside(lambda: "tree", lambda: called.append(1), kind) == "tree"
-    assert len(called) == 1
-    compile_beside(lambda: None, lambda: called.append(1), {"q": np.zeros((4, 11))})
-    assert len(called) == 2
+        compile_together({"q": np.zeros((3, 11))}, *warm_ups)
+    assert sorted(called) == ["end", "start"]
+    compile_together({"q": np.zeros((4, 11))}, *warm_ups)
+    assert len(called) == 4
 
 
-@pytest.mark.parametrize("fails", ["run", "warm_up"])
+@pytest.mark.parametrize("fails", [0, 1])
 def test_what_fails_on_either_thread_is_told_and_tried_again(fails):
     def fail():
         raise ValueError("no program")
 
-    kind = np.zeros((2, 13 if fails == "run" else 17))
-    both = {"run": lambda: None, "warm_up": lambda: None} | {fails: fail}
+    kind, called = np.zeros((2, 13 + fails)), []
+    warm_ups = [lambda: called.append(1)] * 2
     with pytest.raises(ValueError, match="no program"):
-        compile_beside(kind=kind, **both)
-    called = []
-    compile_beside(lambda: None, lambda: called.append(1), kind)
-    assert called
+        compile_together(kind, *warm_ups[:fails], fail, *warm_ups[fails + 1 :])
+    called.clear()
+    compile_together(kind, *warm_ups)
+    assert len(called) == 2
 
 
 def test_a_program_of_the_host_gives_what_others_give():
