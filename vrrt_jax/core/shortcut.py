@@ -4,14 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.edges import (
-    Edge,
-    Space,
-    StraightLineEdges,
-    distance,
-    first_free_edge,
-    steps_between,
-)
+from vrrt_jax.core.edge_checks import first_free_edge
+from vrrt_jax.core.edges import Edge, Space, StraightLineEdges, distance, steps_between
 from vrrt_jax.core.types import pytree
 
 LANES = 16  # candidates in a round

@@ -9,14 +9,8 @@ import pytest
 from core_cases import GOAL, START
 
 import vrrt_jax
-from vrrt_jax.core.edges import (
-    difference,
-    first_free_edge,
-    free_prefix,
-    is_edge_free,
-    normalize,
-    steer,
-)
+from vrrt_jax.core.edge_checks import first_free_edge, free_prefix, is_edge_free
+from vrrt_jax.core.edges import difference, normalize, steer
 from vrrt_jax.core.planners import PLANNERS
 from vrrt_jax.scene.closed_form import ClosedFormWorld
 
