@@ -16,7 +16,7 @@ from nrp_jax.scene.exact import ExactScene, merge_cells
 from nrp_jax.scene.link_shapes import segment_to_cylinder
 from nrp_jax.scene.near_cells import make_near_cells, touches
 from nrp_jax.scene.world import CarWorld
-from vrrt_jax.core.edges import free_prefix
+from vrrt_jax.core.edge_checks import free_prefix
 from vrrt_jax.core.planners.rrt import sample_configurations
 
 pytestmark = pytest.mark.light_compilation
