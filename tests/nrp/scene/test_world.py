@@ -211,11 +211,11 @@ def test_free_steps_against_single_checks(worlds):
     q = sample_configurations(world, jax.random.key(5), 400)
     q = q[np.asarray(nrp_jax.batch_is_free(world, q))][:16]
     q_from, q_to = q[:8], q[8:16]
-    passed, _ = jax.jit(free_prefix, static_argnums=3)(world, q_from, world.edge(q_from, q_to), 64)
+    passed, _ = jax.jit(free_prefix, static_argnums=3)(world, q_from, world.edge(q_from, q_to), 16)
     for a, b, count in zip(q_from, q_to, np.asarray(passed), strict=True):
-        points = interpolate(world, a[None], b[None], jnp.arange(1, 65) / 64)
+        points = interpolate(world, a[None], b[None], jnp.arange(1, 17) / 16)
         free = np.asarray(nrp_jax.batch_is_free(world, points))
-        assert count == (64 if free.all() else np.argmin(free))
+        assert count == (16 if free.all() else np.argmin(free))
 
 
 def test_merged_cells_are_the_cells(rng):
