@@ -33,7 +33,7 @@ from vrrt_jax.motion.export import save_trajectory  # noqa: E402
 from vrrt_jax.motion.limits import MotionLimits, motion_limits  # noqa: E402
 from vrrt_jax.motion.simulate import Tracking, execute_in_sim  # noqa: E402
 from vrrt_jax.motion.trajectory import Trajectory, time_parameterize  # noqa: E402
-from vrrt_jax.planner import plan, plan_batch, plan_to_configuration  # noqa: E402
+from vrrt_jax.planner import plan, plan_batch, plan_to_configuration, plan_waypoints  # noqa: E402
 from vrrt_jax.pose import inverse_kinematics, plan_to_pose  # noqa: E402
 from vrrt_jax.problems import Problem, load_problem, load_world, problem_names  # noqa: E402
 from vrrt_jax.robots import Robot, load_robot, robot_names  # noqa: E402
@@ -125,6 +125,7 @@ __all__ = [
     "plan_batch",
     "plan_to_configuration",
     "plan_to_pose",
+    "plan_waypoints",
     "problem_names",
     "pytree",
     "read_image",

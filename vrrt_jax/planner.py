@@ -26,7 +26,7 @@ from vrrt_jax.splat.types import Camera
 from vrrt_jax.visual.goal import ImageGoal
 from vrrt_jax.visual.lineages import LineageRRT
 from vrrt_jax.visual.policy import VisualRRT
-from vrrt_jax.visual.problem import make_problem
+from vrrt_jax.visual.problem import VisualProblem, make_problem
 
 VISUAL = "visual-rrt"
 
@@ -112,19 +112,16 @@ def plan(
     (start,) = _counted(inputs, "q_start")
     config = PlannerConfig() if config is None else config
     check_config(config)
-    if not isinstance(goal, ImageGoal):
-        check_goal(goal)
     start = checks.check_start(robot, world, start)
     policy = _policy(planner, goal, world, config)
+    problem = _problem(robot, world, goal, start, policy, config)
     roots = start[None]
     if q_guess is not None:
         if isinstance(goal, ConfigurationGoal):
             raise ValueError("q_guess is for goals that are not known; drop it for a joint goal")
         roots = np.stack([start, checks.check_limits(robot, q_guess, "guess")])
-    if isinstance(goal, ConfigurationGoal):
-        goal = _checked_goal(robot, world, goal, policy)
-        return plan_to_goal(robot, world, goal, policy, start, key, config, on_progress)
-    problem = make_problem(robot, goal, start, config)
+    if isinstance(problem, ConfigurationGoal):
+        return plan_to_goal(robot, world, problem, policy, start, key, config, on_progress)
     return plan_by_loss(robot, world, problem, policy, roots, key, config, on_progress)
 
 
@@ -257,12 +254,7 @@ def plan_batch(
                     f"{type(goals[0]).__name__}; expected goals of one kind"
                 )
             starts.append(checks.check_start(robot, own, q_start))
-            if isinstance(goal, ConfigurationGoal):
-                checked.append(_checked_goal(robot, own, goal, policy))
-                continue
-            if not isinstance(goal, ImageGoal):
-                check_goal(goal)
-            checked.append(make_problem(robot, goal, starts[-1], config))
+            checked.append(_problem(robot, own, goal, starts[-1], policy, config))
         except ValueError as error:
             raise ValueError(f"problem {i}: {error}") from None
     if isinstance(goals[0], ConfigurationGoal):
@@ -272,6 +264,56 @@ def plan_batch(
     if any(own is not worlds[0] for own in worlds):
         raise ValueError("goals known by their loss are searched for in one world; got several")
     return plan_batch_by_loss(robot, worlds[0], checked, policy, starts, keys, config, on_progress)
+
+
+def plan_waypoints(
+    robot: Robot,
+    world: World,
+    goals: Sequence[AnyGoal],
+    q_start: np.ndarray,
+    *,
+    key: jax.Array,
+    config: PlannerConfig | None = None,
+    on_progress: Progress = None,
+) -> list[PlanResult]:
+    """Plan to one goal after another, each from where the plan before it ended.
+
+    Each leg begins exactly where the one before it ended, so that
+    ``np.concatenate([q_start[None], *(leg.path[1:] for leg in legs)])`` is the whole way.
+
+    Args:
+        robot: from :func:`load_robot`.
+        world: for this robot.
+        goals: where to, in turn: image goals, joint goals, or both.
+        q_start: (D,) start configuration of the first leg [rad] or [m].
+        key: random key; leg ``i`` uses ``fold_in(key, i)``.
+        config: settings of each leg, the default ones if None.
+        on_progress: called with the search state and the seconds so far of the leg.
+
+    Returns:
+        A result a leg. The first one that is not solved is the last.
+
+    Raises:
+        ValueError: an input makes no sense; all goals are looked at before the first leg.
+    """
+    config = PlannerConfig() if config is None else config
+    check_config(config)
+    q_start = checks.check_start(robot, world, q_start)
+    if not goals:
+        raise ValueError("the goals are an empty list; expected one at least")
+    for i, goal in enumerate(goals):
+        try:
+            _problem(robot, world, goal, q_start, _policy(None, goal, world, config), config)
+        except ValueError as error:
+            raise ValueError(f"goal {i}: {error}") from None
+    legs: list[PlanResult] = []
+    for i, goal in enumerate(goals):
+        start, leg_key = legs[-1].path[-1] if legs else q_start, jax.random.fold_in(key, i)
+        run = {"key": leg_key, "config": config, "on_progress": on_progress}
+        legs.append(plan(robot, world, goal, start, **run))
+        if not legs[-1].ok:
+            break
+    return legs
 
 
 def _policy(
@@ -298,6 +340,26 @@ def _policy(
     if not has_configuration:
         raise ValueError(_needs_configuration(planner, goal))
     return PLANNERS[planner].for_world(world, lanes=config.tree.lanes)
+
+
+def _problem(
+    robot: Robot,
+    world: World,
+    goal: AnyGoal,
+    start: np.ndarray,
+    policy: ExpansionPolicy,
+    config: PlannerConfig,
+) -> ConfigurationGoal | VisualProblem:
+    """What is searched for: a joint goal, or a goal known by its loss.
+
+    Raises:
+        ValueError: the goal makes no sense.
+    """
+    if isinstance(goal, ConfigurationGoal):
+        return _checked_goal(robot, world, goal, policy)
+    if not isinstance(goal, ImageGoal):
+        check_goal(goal)
+    return make_problem(robot, goal, start, config)
 
 
 def _checked_goal(

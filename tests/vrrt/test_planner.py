@@ -94,6 +94,28 @@ def test_batch_equals_single_plans(panda, self_model, camera, image, open_world)
         np.testing.assert_allclose(batch[i].tree.q[:80], single.tree.q[:80], atol=1e-3)
 
 
+def test_goals_are_visited_in_turn(panda, self_model, camera, image, open_world):
+    run = {"key": jax.random.key(0), "config": QUICK}
+    shown, home = ImageGoal(self_model, camera, image), vrrt_jax.ConfigurationGoal(q=Q_START)
+    legs = vrrt_jax.plan_waypoints(panda, open_world, [shown, home], Q_START, **run)
+    assert [leg.ok for leg in legs] == [True, True]
+    assert np.abs(legs[0].path[-1] - Q_GOAL).mean() < 0.05
+    np.testing.assert_array_equal(legs[1].path[0], legs[0].path[-1])
+    np.testing.assert_allclose(legs[1].path[-1], Q_START, atol=1e-3)
+    way = np.concatenate([Q_START[None], *(leg.path[1:] for leg in legs)])
+    assert vrrt_jax.verify_path(panda, open_world, way).ok
+    # The first leg that fails is the last; nothing is planned where one goal makes no sense.
+    short = QUICK.changed({"budget.time_limit_s": 1e-9})
+    legs = vrrt_jax.plan_waypoints(
+        panda, open_world, [shown, home], Q_START, **run | {"config": short}
+    )
+    assert [leg.status for leg in legs] == [vrrt_jax.Status.TIME_LIMIT]
+    far = vrrt_jax.ConfigurationGoal(q=Q_START + 9)
+    for goals, told in (([shown, far], "goal 1: .*limit"), ([], "empty list")):
+        with pytest.raises(ValueError, match=told):
+            vrrt_jax.plan_waypoints(panda, open_world, goals, Q_START, **run)
+
+
 def test_the_short_form_is_an_image_goal(panda, self_model, camera, image, open_world):
     config = QUICK.changed({"budget.max_iterations": 3, "budget.attempts": 1, "polish.rounds": 1})
     mask = np.ones(image.shape[:2], bool)
