@@ -31,7 +31,7 @@ from vrrt_jax.splat.lanes import map_lanes
 from vrrt_jax.splat.types import Camera, SplatModel
 from vrrt_jax.visual.distinct import distinct
 from vrrt_jax.visual.goal import CloseUp
-from vrrt_jax.visual.polish_samples import last_hinge, redraw_outer, sample_around
+from vrrt_jax.visual.polish_samples import last_hinge, nearer_turns, redraw_outer, sample_around
 from vrrt_jax.visual.twins import twins
 
 LINEARIZE_BATCH = 4  # configurations in one call: with their differences, a batch of renders
@@ -117,6 +117,7 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
     """
     rng = np.random.default_rng(seed)
     config, coarse, fine = polishing.config, polishing.coarse, polishing.fine
+    q_start = np.asarray(fine.q_start)
 
     # Rounds on the coarse image: sample, keep the best, descend, keep distinct ends. Where nothing
     # matches after all rounds, there are as many again, with more samples.
@@ -128,6 +129,7 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
             num, lanes = LATE_SAMPLES * config.samples // 2, 2 * config.lanes
             around = sample_around(q, last_hinge(world), num, config.spread, rng)
             samples = np.concatenate([around, redraw_outer(world, q, num, rng)])
+        samples = nearer_turns(world, samples, q_start)
         cost = _in_batches(evaluate_cost, world, coarse, samples, EVALUATE_BATCH)[0]
         best = samples[np.argsort(cost, kind="stable")[:lanes]]
         ends = _descend(lambda q, _: _linearize(world, coarse, q), best, config.steps)
@@ -138,7 +140,7 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
             break
 
     # The fine image, from every minimum over a whole turn of the last joint.
-    turned = _turns_oflast_hinge(world, fine, q, config.kept)
+    turned = _turns_of_last_hinge(world, fine, q, config.kept)
     ends = _descend(lambda q, _: _linearize(world, fine, q), turned, config.steps)
     kept = _with_twins(world, fine, _distinct_ends(world, ends, config.kept), config)
 
@@ -176,7 +178,7 @@ def _with_twins(
     world: World, goal: PriorGoal, ends: _GaussNewtonModel, config: PolishConfig
 ) -> _GaussNewtonModel:
     """The best of the ends and of the kinematic twins of the few best."""
-    others = twins(world, ends.q[:TWINNED])
+    others = nearer_turns(world, twins(world, ends.q[:TWINNED]), np.asarray(goal.q_start))
     if not len(others):
         return ends
     found = _descend(lambda q, _: _linearize(world, goal, q), others, config.steps)
@@ -208,7 +210,7 @@ def _distinct_ends(world: World, model: _GaussNewtonModel, num: int) -> _GaussNe
     return model.take(rows)
 
 
-def _turns_oflast_hinge(world: World, goal: PriorGoal, q: np.ndarray, num: int) -> np.ndarray:
+def _turns_of_last_hinge(world: World, goal: PriorGoal, q: np.ndarray, num: int) -> np.ndarray:
     """The best (at most num, D) of configurations (H, D) and their minima over the last joint.
 
     Its turn is what images tell least: a gripper spins about its axis and hardly changes.
@@ -216,6 +218,7 @@ def _turns_oflast_hinge(world: World, goal: PriorGoal, q: np.ndarray, num: int) 
     joints = q.shape[1]
     turn = 2 * np.pi / TURNS * np.arange(TURNS)
     around = (q[:, None] + turn[:, None] * np.eye(joints)[last_hinge(world)]).reshape(-1, joints)
+    around = nearer_turns(world, around, np.asarray(goal.q_start))
     cost = _in_batches(evaluate_cost, world, goal, around, EVALUATE_BATCH)[0].reshape(-1, TURNS)
     # A turn is a minimum if both of its neighbors cost more; no turn at all is always one.
     is_minimum = (cost < np.roll(cost, 1, axis=1)) & (cost <= np.roll(cost, -1, axis=1))

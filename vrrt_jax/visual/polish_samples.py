@@ -10,8 +10,22 @@ INNER_SPREAD = 0.05  # [rad] of joints that are not drawn anew
 
 def last_hinge(world: World) -> int:
     """The joint that turns the hand, behind which there may be sliding fingers."""
-    hinges = np.flatnonzero(~np.any(np.asarray(world.chain.slide), axis=(1, 2)))
+    hinges = np.flatnonzero(_is_hinge(world))
     return int(hinges[-1]) if len(hinges) else -1
+
+
+def nearer_turns(world: World, q: np.ndarray, q_start: np.ndarray) -> np.ndarray:
+    """The same poses (n, D), of all turns inside the limits those next to a start (D,).
+
+    Joints such as those of a UR5e have room for two turns, which no image tells apart.
+    """
+    turned = q - 2 * np.pi * np.round((q - q_start) / (2 * np.pi))
+    inside = (turned >= np.asarray(world.lower)) & (turned <= np.asarray(world.upper))
+    return np.where(inside & _is_hinge(world), turned, q)
+
+
+def _is_hinge(world: World) -> np.ndarray:
+    return ~np.any(np.asarray(world.chain.slide), axis=(1, 2))
 
 
 def sample_around(

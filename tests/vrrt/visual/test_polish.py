@@ -15,7 +15,7 @@ from vrrt_jax.visual.polish import (
     linearize,
     polish,
 )
-from vrrt_jax.visual.polish_samples import redraw_outer
+from vrrt_jax.visual.polish_samples import nearer_turns, redraw_outer
 from vrrt_jax.visual.problem import make_problem
 
 
@@ -87,3 +87,17 @@ def test_outer_joints_are_drawn_anew(panda, open_world, rng):
     # The first joint always stays, the last never, the others the more rarely the farther out.
     share = near.mean(axis=0)
     assert share[0] == 1.0 and np.all(np.diff(share) < 0.05) and share[-1] < 0.3
+
+
+def test_of_whole_turns_the_next_to_the_start_is_taken():
+    """A UR5e has room for two turns of most joints, and its elbow for one."""
+    ur5e = vrrt_jax.load_robot("ur5e")
+    world = vrrt_jax.build_world(ur5e, [], engine="closed_form")
+    start = np.array([6.0, -1.5, 1.5, 0.0, 0.5, -6.0])
+    q = np.array([[0.3, 4.5, -3.0, -6.0, 0.6, 0.0]])
+    nearer = nearer_turns(world, q, start)
+    # The first joint has no room for 0.3 + 2 pi, the elbow none for -3.0 + 2 pi.
+    expected = [[0.3, 4.5 - 2 * np.pi, -3.0, -6.0 + 2 * np.pi, 0.6, -2 * np.pi]]
+    np.testing.assert_allclose(nearer, expected)
+    poses = [vrrt_jax.link_poses(ur5e.chain, jnp.asarray(a[0], jnp.float32)) for a in (q, nearer)]
+    np.testing.assert_allclose(*poses, atol=1e-5)
