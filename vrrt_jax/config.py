@@ -72,8 +72,9 @@ class MatchConfig:
     """When an image counts as matched, and which of several matches is taken."""
 
     scale: float = setting(1.0, 1e-9)  # the threshold, in units of the self-model's calibrated one
-    # Weight of a match's squared distance from the start: added cost per rad^2, as a share of it.
-    start_preference: float = setting(0.007, 0.0)
+    # Matches whose cost is within this factor of the best one's look the same: the nearest to the
+    # start is taken, and the others are named.
+    ambiguity: float = setting(1.1, 1.0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -33,7 +33,7 @@ ABLATIONS = {
         "polish.rounds": (1,),
         "polish.close_px": (0,),
         "polish.start_prior": (0.0,),
-        "match.start_preference": (0.0,),
+        "match.ambiguity": (1.0,),
         "budget.attempts": (1,),
         "budget.settle_iterations": (0,),
     },

@@ -29,7 +29,6 @@ MAX_REPLANS = 3  # paths that the exact check may refuse before it has the last 
 MARGIN_STEP = 0.01  # [m] by which each of them keeps farther away than the one before
 UNTOLD = 0.3  # [rad] or [m] joints that may be off by more are named
 SAME_LOSS = 1.05  # losses within this factor are the same match
-AMBIGUITY_RATIO = 1.1  # and within this factor the image does not tell which it is
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,7 +108,8 @@ def finish_visual(
         result = with_time_of(other if other.ok else result, result, other)
 
     matching = [k for k in ends.rivals if ends.loss[k] <= ends.threshold]
-    alike = [k for k in matching if k != end and ends.cost[k] <= AMBIGUITY_RATIO * ends.cost[end]]
+    as_good = config.match.ambiguity * ends.cost[end]
+    alike = [k for k in matching if k != end and ends.cost[k] <= as_good]
     if result.status is Status.NO_PATH and all_collide:
         advice = "all that was found is in collision: move the obstacles"
         result = dataclasses.replace(result, advice=advice)
@@ -202,10 +202,12 @@ def _polished_ends(
     config: PlannerConfig,
 ) -> Ends:
     """Polished configurations in the order in which they are tried."""
-    # Of two that look alike, the nearer to the start is likelier; a match goes before all others.
-    far = distances_to(world, polished.q, q_start) ** 2
-    preference = polished.cost * (1.0 + config.match.start_preference * far)
-    order = np.lexsort([preference, polished.loss > threshold])
+    # A match goes before all others; of those that look the same, the nearest to the start.
+    fits = polished.loss <= threshold
+    least = np.min(polished.cost, where=fits, initial=np.inf)
+    alike = fits & (polished.cost <= config.match.ambiguity * least)
+    far = distances_to(world, polished.q, q_start)
+    order = np.lexsort([np.where(alike, far, polished.cost), ~alike, ~fits])
     rivals = [int(k) for k in order if np.isfinite(polished.cost[k])]
     matched = [k for k in rivals if polished.loss[k] <= threshold]
     return Ends(

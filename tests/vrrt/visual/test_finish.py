@@ -44,9 +44,7 @@ def test_ambiguous_goals_are_told(panda, self_model, camera, open_world):
     assert result.ok and result.match_probability > 0.5
     np.testing.assert_allclose(result.target, Q_GOAL, atol=0.02)
     assert len(result.alternatives) == 0  # an exact image tells them apart
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(finish, "AMBIGUITY_RATIO", np.inf)
-        result = finish.finish_visual(*args)
+    result = finish.finish_visual(*args[:-1], config.changed({"match.ambiguity": 1e9}))
     apart = np.abs(result.alternatives - HALF_TURNED).max(axis=1)
     assert len(apart) >= 1 and apart.min() < 0.3
     assert f"ambiguous: {len(apart)} other" in str(result)
