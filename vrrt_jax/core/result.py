@@ -2,11 +2,12 @@
 
 import dataclasses
 import enum
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
+from vrrt_jax.core.result_html import result_html
 from vrrt_jax.core.search import SearchResult, StopReason
 from vrrt_jax.core.types import Rejection, Tree
 
@@ -88,6 +89,9 @@ class PlanResult:
     # Of the length of ``raw_path``, what ``tree`` and an edge from it led along. RRT-Connect, which
     # goes on from the tree where no such edge is free, found the rest.
     tree_share: float = 1.0
+    # Draws this result for notebooks, (H, W, 3) uint8: the goal image beside the end of the path,
+    # or the way through a home. None where nothing is to be seen, as of joint goals.
+    draw: Callable[["PlanResult"], np.ndarray] | None = None
 
     @property
     def ok(self) -> bool:
@@ -110,6 +114,10 @@ class PlanResult:
             f"{int(self.tree.size)} nodes; "
             f"{times}{ambiguous}"
         )
+
+    def _repr_html_(self) -> str:
+        """The same for notebooks, with a picture."""
+        return result_html(self)
 
 
 def rejected_lanes(found: SearchResult) -> dict[str, int]:
