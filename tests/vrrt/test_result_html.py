@@ -8,8 +8,8 @@ import re
 import jax
 import numpy as np
 import pytest
-from PIL import Image
 from pictures import Q_GOAL
+from PIL import Image
 
 import nrp_jax
 import vrrt_jax
