@@ -18,6 +18,7 @@ class TopView:
     """Draws a result: the map, and the way of the robot's base through it."""
 
     grid: Grid
+    caption = "from above: the start (green), the way of the base, and the goal (red)"
 
     def __call__(self, result: PlanResult) -> np.ndarray:
         """The picture (H, W, 3) uint8, with +y upwards; start green, goal red."""

@@ -49,7 +49,9 @@ def test_texts_are_escaped(result):
 
 def test_an_image_goal_stands_beside_the_end(result, panda, self_model, camera, image):
     goal = vrrt_jax.ImageGoal(self_model, camera, image)
-    (shown,) = pictures(dataclasses.replace(result, draw=EndPicture(goal, panda))._repr_html_())
+    html = dataclasses.replace(result, draw=EndPicture(goal, panda))._repr_html_()
+    assert EndPicture.caption in html
+    (shown,) = pictures(html)
     target, end = np.split(shown.astype(float), 2, axis=1)
     assert target.min() < 100  # the robot is there
     there = np.abs(target - end).mean()

@@ -2,8 +2,8 @@
 
 import dataclasses
 import enum
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -45,6 +45,19 @@ class Verification:
     contact: str | None  # the first violation, such as "link5 touches box_2 at 37 % of the path"
     clearance: float = float("nan")  # smallest distance to obstacles, where it is measured [m]
     geometry: str = "primitives"  # what the robot was made of, or "meshes", or "spheres"
+
+
+class Drawing(Protocol):
+    """What draws a result for notebooks."""
+
+    @property
+    def caption(self) -> str:
+        """What the picture shows."""
+        ...
+
+    def __call__(self, result: "PlanResult") -> np.ndarray:
+        """The picture, (H, W, 3) uint8."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
@@ -89,9 +102,9 @@ class PlanResult:
     # Of the length of ``raw_path``, what ``tree`` and an edge from it led along. RRT-Connect, which
     # goes on from the tree where no such edge is free, found the rest.
     tree_share: float = 1.0
-    # Draws this result for notebooks, (H, W, 3) uint8: the goal image beside the end of the path,
-    # or the way through a home. None where nothing is to be seen, as of joint goals.
-    draw: Callable[["PlanResult"], np.ndarray] | None = None
+    # For notebooks: the goal image beside the end of the path, or the way through a home. None
+    # where nothing is to be seen, as of joint goals.
+    draw: Drawing | None = None
 
     @property
     def ok(self) -> bool:

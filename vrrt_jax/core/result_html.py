@@ -24,7 +24,8 @@ def result_html(result: "PlanResult") -> str:
     if result.advice:
         parts.append(f"<div><i>{escape(result.advice)}</i></div>")
     if result.draw is not None:
-        parts.append(f"<div>{_picture(result.draw(result))}</div>")
+        caption = escape(result.draw.caption)
+        parts.append(f"<div>{_picture(result.draw(result))}<br><small>{caption}</small></div>")
     rows = "".join(
         f'<tr><th style="{_CELL}">{escape(name)}</th><td style="{_CELL}">{escape(text)}</td></tr>'
         for name, text in _rows(result)

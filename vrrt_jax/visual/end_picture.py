@@ -23,6 +23,7 @@ class EndPicture:
 
     goal: ImageGoal
     robot: Robot
+    caption = "the goal image, and the end of the path"
 
     @single_precision
     def __call__(self, result: PlanResult) -> np.ndarray:
