@@ -22,7 +22,7 @@ class TopView:
 
     def __call__(self, result: PlanResult) -> np.ndarray:
         """The picture (H, W, 3) uint8, with +y upwards; start green, goal red."""
-        solid = self.grid.occupied.any(axis=2)
+        solid = np.asarray(self.grid.occupied.any(axis=2))
         scale = PICTURE_PX / max(solid.shape)
         size = [max(1, round(scale * side)) for side in solid.shape]
         cells = Image.fromarray(np.where(solid.T[::-1], np.uint8(255), np.uint8(0)))
@@ -32,8 +32,8 @@ class TopView:
         corner, px_per_m = np.asarray(self.grid.origin[:2]), scale / self.grid.resolution
 
         def at(q: np.ndarray) -> list[tuple[float, float]]:
-            x, y = px_per_m * (np.atleast_2d(q)[:, :2] - corner).T
-            return list(zip(x.tolist(), (size[1] - y).tolist(), strict=True))
+            places = px_per_m * (np.atleast_2d(q)[:, :2] - corner)
+            return [(float(x), size[1] - float(y)) for x, y in places]
 
         if len(result.trajectory) > 1:
             pen.line(at(result.trajectory), fill=_WAY, width=2)
