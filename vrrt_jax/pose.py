@@ -18,6 +18,7 @@ from vrrt_jax.core.rigid import rigid
 from vrrt_jax.core.search import no_search
 from vrrt_jax.joint import plan_to_goal
 from vrrt_jax.outcome import Chosen, Progress, finish
+from vrrt_jax.robots.bodies import moving_body
 from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.verify import contacts
@@ -62,7 +63,7 @@ def inverse_kinematics(
         robot: from :func:`load_robot`.
         world: for this robot.
         pose: (4, 4) of the link in the world's frame [m].
-        link: of ``robot.link_names``; the last if None.
+        link: a moving body of the robot, such as "hand"; the last of ``robot.link_names`` if None.
         key: random key.
         q_near: (D,) where to begin and what to stay near; the robot's home if None.
         num: at most so many, which differ by more than 0.3 rad.
@@ -75,7 +76,9 @@ def inverse_kinematics(
         Unreached: there is none; a ValueError that says how near the link gets, or that all are in
             collision.
     """
-    index, target = _link_index(robot, link), jnp.asarray(rigid(pose, "the pose"), jnp.float32)
+    link = robot.link_names[-1] if link is None else link
+    index, in_link = moving_body(robot, link)
+    target = jnp.asarray(rigid(pose, "the pose") @ np.linalg.inv(in_link), jnp.float32)
     q_near = robot.home if q_near is None else checks.check_limits(robot, q_near, "q_near")
     nearest, least = q_near, np.inf
     reached = 0
@@ -94,15 +97,14 @@ def inverse_kinematics(
         if np.min(away) < least:
             nearest, least = q[np.argmin(away)], np.min(away)
             missed = f"{meters[np.argmin(away)]:.3g} m and {radians[np.argmin(away)]:.3g} rad"
-    name = robot.link_names[index]
     if not reached:
-        told = f"'{name}' stays {missed} from the pose; move it to where the arm reaches"
+        told = f"'{link}' stays {missed} from the pose; move it to where the arm reaches"
         raise Unreached(told, nearest)
     touching = contacts(robot, world, nearest) or contacts(
         robot, world, nearest, geometry="spheres"
     )
     raise Unreached(
-        f"all {reached} configurations that take '{name}' there are in collision, one of them: "
+        f"all {reached} configurations that take '{link}' there are in collision, one of them: "
         f"{'; '.join(touching[:4]) or 'within the margin'}; move the obstacles or the pose",
         nearest,
     )
@@ -130,7 +132,7 @@ def plan_to_pose(
         world: for this robot.
         q_start: (D,) [rad] or [m].
         pose: (4, 4) of the link in the world's frame [m].
-        link: of ``robot.link_names``; the last if None.
+        link: a moving body of the robot, such as "hand"; the last of ``robot.link_names`` if None.
         key: random key.
         config: budget, capacity, lanes and margin are used.
         on_progress: called with the search state and the seconds so far.
@@ -216,16 +218,3 @@ def _descend(
     damping = jnp.full(len(q), 1e-3)
     q = jax.lax.while_loop(goes_on, descend, (jnp.int32(0), q, damping))[1]
     return q, *errors(q), jax.vmap(world.is_free)(q)
-
-
-def _link_index(robot: Robot, link: str | None) -> int:
-    """Which link has this name.
-
-    Raises:
-        ValueError: none has.
-    """
-    if link is None:
-        return len(robot.link_names) - 1
-    if link not in robot.link_names:
-        raise ValueError(f"unknown link '{link}'; have: {', '.join(robot.link_names)}")
-    return robot.link_names.index(link)

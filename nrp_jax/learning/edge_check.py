@@ -1,12 +1,12 @@
 """Edge checks that stop early: of a roadmap's many edges, and of a lane's ranked waypoints.
 
-Planners check edges with :func:`vrrt_jax.core.edges.free_prefix`: a fixed number of sub-steps on
-every edge, from its start on, as they want to know how far it is free. :func:`first_free` uses it
-too. :func:`check_edges` cannot. A roadmap has a million edges of very different lengths, only wants
-to know whether a whole edge is free, and most edges are blocked. So each edge gets the fewest
-sub-steps that its length needs, these are checked from the middle outwards, and an edge is dropped
-as soon as one configuration collides. Letters: ``N`` nodes, ``M`` edges, ``B`` lanes, ``K``
-waypoints of a lane, ``D`` joints.
+Planners check edges with :func:`vrrt_jax.core.edge_checks.free_prefix` inside their programs, from
+coarse to fine. :func:`first_free` uses it too. :func:`check_edges` need not run inside a program: a
+roadmap has a million edges of very different lengths, only wants to know whether a whole edge is
+free, and most edges are blocked. So each edge gets the fewest sub-steps that its length needs, all
+of one size, these are checked from the middle outwards, and the host drops an edge as soon as one
+configuration collides. Letters: ``N`` nodes, ``M`` edges, ``B`` lanes, ``K`` waypoints of a lane,
+``D`` joints.
 """
 
 from typing import Any
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax.scene.world import GridWorld
-from vrrt_jax.core.edges import free_prefix
+from vrrt_jax.core.edge_checks import free_prefix
 
 # Edges prepared by one compiled call. Data sets depend on it: with batches of another size, lengths
 # differ in their last bits.

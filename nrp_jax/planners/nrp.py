@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from nrp_jax.samplers import proposed
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import free_prefix
+from vrrt_jax.core.edge_checks import free_prefix
 from vrrt_jax.core.expand import SHORTEST_EDGE
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners.rrt import RRT

@@ -8,7 +8,8 @@ import jax
 import numpy as np
 
 from vrrt_jax.config import Budget, PlannerConfig
-from vrrt_jax.core.edges import free_prefix, joint_error
+from vrrt_jax.core.edge_checks import free_prefix
+from vrrt_jax.core.edges import joint_error
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.search import make_termination, search
 from vrrt_jax.core.timing import interleaved_ms

@@ -1,11 +1,9 @@
-"""Edges: how a robot goes from one configuration to another, and how far it is free to.
+"""Edges: how a robot goes from one configuration to another.
 
 A world says what its edges are, so that the kernel serves straight lines, turning joints and curves
 alike. An edge is a pytree of arrays that lead with the lanes; what is in it, only the world knows.
 """
 
-import math
-from collections.abc import Callable
 from typing import Any, ClassVar, Protocol
 
 import jax
@@ -14,13 +12,8 @@ import numpy as np
 
 from vrrt_jax.core.boxes import box_inside_limits, half_extents
 from vrrt_jax.core.precision import single_precision
-from vrrt_jax.core.types import pytree
 
 Edge = Any
-
-# Configurations that are checked at once, of all edges together: many where most edges will have to
-# be followed, few where most will be given up.
-CHECKS, FEW_CHECKS = 64, 32
 
 
 class Space(Protocol):
@@ -251,170 +244,3 @@ def steer(
     step = jnp.where(world.is_continuous, step, inside)
     length = jnp.sqrt(jnp.sum(step**2, axis=-1, keepdims=True))
     return step * jnp.minimum(1.0, max_length / jnp.maximum(length, 1e-12))
-
-
-def num_checks(world: Space, max_step: float) -> int:
-    """How many sub-steps, each no longer than the world's resolution, an edge needs; on the host.
-
-    Args:
-        world: whose resolution it is.
-        max_step: longest edge, in the units of the resolution.
-    """
-    return max(1, math.ceil(max_step / float(world.resolution) - 1e-3))
-
-
-def free_prefix(
-    world: Space,
-    q_from: jax.Array,
-    edge: Edge,
-    num_steps: int,
-    tried: jax.Array | bool = True,
-    partial: jax.Array | bool = True,
-) -> tuple[jax.Array, jax.Array]:
-    """How far one can go along edges before something is touched.
-
-    Args:
-        world: what to collide with.
-        q_from: (B, D) starts, taken to be free.
-        edge: of B lanes.
-        num_steps: S sub-steps along each edge, checked at their far ends.
-        tried: (B,) bool, which edges count; the others are not checked.
-        partial: (B,) bool, of which the free part matters. Of the others only whether they are free
-            is asked: if they are not, the number is some number below S.
-
-    Returns:
-        (B,) i32 number of leading sub-steps that are free, S where the whole edge is; and () i32
-        how many configurations were checked for that.
-    """
-    tried, partial = (jnp.reshape(mask, (-1, 1)) for mask in (tried, partial))
-
-    def matters(checks: _Checks, step: jax.Array) -> jax.Array:
-        return tried & (step < jnp.where(partial | (checks.first == num_steps), checks.first, 0))
-
-    checks = _check(world, q_from, edge, num_steps, matters)
-    return checks.first[:, 0], checks.checked
-
-
-def is_edge_free(
-    world: Space, q_from: jax.Array, edge: Edge, num_steps: int, tried: jax.Array | bool = True
-) -> tuple[jax.Array, jax.Array]:
-    """Whether (B,) nothing is touched along whole edges, and () i32 how many checks that took.
-
-    An edge costs nothing more once something is found on it, and nothing at all if it is not
-    ``tried`` (B,). See :func:`free_prefix`.
-    """
-    num_free, checked = free_prefix(world, q_from, edge, num_steps, tried, partial=False)
-    return (num_free == num_steps) & tried, checked
-
-
-def first_free_edge(
-    world: Space, q_from: jax.Array, edge: Edge, num_steps: int, tried: jax.Array
-) -> jax.Array:
-    """The first of B edges along which nothing is touched, () i32; B if there is none.
-
-    Edges after one that is known to be free cost nothing more.
-
-    Args:
-        world: what to collide with.
-        q_from: (B, D) starts, taken to be free; the ends are too.
-        edge: of B lanes, the most wanted first.
-        num_steps: S sub-steps along each edge.
-        tried: (B,) bool, which edges count.
-    """
-    lanes = q_from.shape[0]
-    lane = jnp.arange(lanes)[:, None]
-
-    def first_free(checks: _Checks) -> jax.Array:
-        is_free = jnp.all(checks.known, axis=1) & (checks.first[:, 0] == num_steps) & tried
-        return jnp.where(jnp.any(is_free), jnp.argmax(is_free), lanes)
-
-    def matters(checks: _Checks, step: jax.Array) -> jax.Array:
-        is_open = (checks.first == num_steps) & tried[:, None]
-        return is_open & (lane < first_free(checks)) & (step < num_steps - 1)
-
-    few = FEW_CHECKS
-    checks = _check(world, q_from, edge, num_steps, matters, ends_known=True, batch=few)
-    return first_free(checks)
-
-
-@pytree
-class _Checks:
-    known: jax.Array  # (B, S) bool, checked or known to be free
-    first: jax.Array  # (B, 1) i32 the first sub-step known to be blocked, S if none is
-    checked: jax.Array  # () i32 configurations checked
-
-
-def _check(
-    world: Space,
-    q_from: jax.Array,
-    edge: Edge,
-    num_steps: int,
-    matters: Callable[[_Checks, jax.Array], jax.Array],
-    ends_known: bool = False,
-    batch: int = CHECKS,
-) -> _Checks:
-    """Check sub-steps of B edges until none that matters is left.
-
-    Ends and middles come first: what is found there spares the checks between. A batch of checks is
-    what is left of the coarsest levels, of all edges together.
-
-    Args:
-        world: what to collide with.
-        q_from: (B, D).
-        edge: of B lanes.
-        num_steps: S.
-        matters: of the checks so far and the indices (S,) of sub-steps, whether (B, S) a sub-step
-            still has to be checked.
-        ends_known: the ends are taken to be free.
-        batch: sub-steps that are checked at once.
-    """
-    lanes, step = q_from.shape[0], jnp.arange(num_steps)
-    order = jnp.asarray(_coarse_to_fine(num_steps))
-    batch = min(batch, lanes * num_steps)
-
-    def open_checks(checks: _Checks) -> jax.Array:
-        """Which sub-steps have to be checked, (S * B,) the coarsest first."""
-        needed = ~checks.known & matters(checks, step)
-        return needed[:, order].T.reshape(-1)
-
-    def check(checks: _Checks) -> _Checks:
-        # The next batch: lanes and sub-steps.
-        needed = open_checks(checks)
-        chosen = jnp.flatnonzero(needed, size=batch, fill_value=lanes * num_steps)
-        valid = chosen < lanes * num_steps
-        lane = jnp.where(valid, chosen % lanes, 0)
-        at = jnp.where(valid, order[jnp.where(valid, chosen // lanes, 0)], 0)
-        # Their configurations, and how much of the edge is free around each.
-        edges = jax.tree.map(lambda leaf: leaf[lane], edge)
-        part = world.truncate(edges, (at + 1).astype(q_from.dtype) / num_steps)
-        span = jax.vmap(world.free_span)(world.end(q_from[lane], part), edges)
-        # Book what is blocked, and all sub-steps within the free spans.
-        blocked = valid & ~(span >= 0)
-        first = checks.first.at[jnp.where(blocked, lane, lanes), 0].min(at, mode="drop")
-        reach = jnp.minimum(jnp.maximum(span, 0.0) * num_steps, num_steps).astype(jnp.int32)
-        lane = jnp.where(valid, lane, lanes)
-        change = jnp.zeros((lanes, num_steps + 1), jnp.int32)
-        change = change.at[lane, jnp.maximum(at - reach, 0)].add(1, mode="drop")
-        change = change.at[lane, jnp.minimum(at + reach, num_steps - 1) + 1].add(-1, mode="drop")
-        covered = jnp.cumsum(change, axis=1)[:, :num_steps] > 0
-        checked = checks.checked + jnp.sum(valid, dtype=jnp.int32)
-        return _Checks(known=checks.known | covered, first=first, checked=checked)
-
-    start = _Checks(
-        known=jnp.broadcast_to(ends_known & (step == num_steps - 1), (lanes, num_steps)),
-        first=jnp.full((lanes, 1), num_steps, jnp.int32),
-        checked=jnp.int32(0),
-    )
-    return jax.lax.while_loop(lambda checks: jnp.any(open_checks(checks)), check, start)
-
-
-def _coarse_to_fine(num: int) -> np.ndarray:
-    """Indices 0 to num - 1, the last one first, then the middle, the quarters and so on."""
-    order, gaps = [num - 1], [(-1, num - 1)]
-    while gaps:
-        low, high = gaps.pop(0)
-        if high - low > 1:
-            middle = (low + high) // 2
-            order.append(middle)
-            gaps += [(low, middle), (middle, high)]
-    return np.array(order, np.int32)

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import Space, free_prefix
+from vrrt_jax.core.edge_checks import free_prefix
+from vrrt_jax.core.edges import Space
 from vrrt_jax.core.types import Expansion, ExpansionPolicy, Payload, Rejection, Tree
 
 SHORTEST_EDGE = 1e-5  # [rad] a shorter step would only duplicate its parent

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import Space, distance, is_edge_free
+from vrrt_jax.core.edge_checks import is_edge_free
+from vrrt_jax.core.edges import Space, distance
 from vrrt_jax.core.types import Expansion, Tree
 
 Payload = TypeVar("Payload")

@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.compiling import host_jit
+from vrrt_jax.core.edge_checks import first_free_edge
 from vrrt_jax.core.edges import (
     Edge,
     Space,
     StraightLineEdges,
     distance,
-    first_free_edge,
     steps_between,
 )
 from vrrt_jax.core.types import pytree

@@ -1,7 +1,6 @@
 """Attach an object to the hand, so that it moves with it and is checked as a part of the robot."""
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,7 +9,7 @@ import mujoco
 import numpy as np
 
 from vrrt_jax.core.precision import single_precision
-from vrrt_jax.robots.kinematics import chain_from_model
+from vrrt_jax.robots.bodies import body_pose, moving_body
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.held import Grip, HeldObject, HeldSpheres
 from vrrt_jax.scene.held_cover import corners, cover
@@ -109,7 +108,7 @@ def detach(world: World, name: str, *, q: Sequence[float] | np.ndarray | None = 
     bare = world.holding([other for other in world.attached if other is not held])
     if q is None:
         return bare
-    pose = _body_pose(world, held.body, _checked(world, q)) @ pose_of(held.obstacle)
+    pose = body_pose(world.robot.value, held.body, _checked(world, q)) @ pose_of(held.obstacle)
     return with_obstacles(bare, [*obstacle_list(bare), _placed(held.obstacle, pose)])
 
 
@@ -127,21 +126,16 @@ def _held(
     world: World, obstacles: Sequence[Obstacle], obstacle: Obstacle, body: str, q: Any
 ) -> HeldObject:
     """An object held by a body among other obstacles."""
-    bodies = _bodies(world.robot.value)
-    moving = [name for name, (link, _) in bodies.items() if link]
-    if body not in moving:
-        what = "does not move" if body in bodies else "is no link of the robot"
-        raise ValueError(f"'{body}' {what}; have: {', '.join(moving)}")
-    link, in_link = bodies[body]
+    link, in_link = moving_body(world.robot.value, body)
     if q is not None:
-        pose = np.linalg.inv(_body_pose(world, body, _checked(world, q))) @ pose_of(obstacle)
-        obstacle = _placed(obstacle, pose)
+        hand = body_pose(world.robot.value, body, _checked(world, q))
+        obstacle = _placed(obstacle, np.linalg.inv(hand) @ pose_of(obstacle))
     around = cover(obstacle.kind, (*floats(obstacle.size), 0.0, 0.0)[:3])
     spheres = _on_link(link, in_link @ pose_of(obstacle), around.center, around.radius)
     held = HeldObject(obstacle=obstacle, body=body, spheres=spheres, bulge=around.bulge)
     if q is None:
         return held
-    to_world = _body_pose(world, body, _checked(world, q)) @ np.linalg.inv(in_link)
+    to_world = hand @ np.linalg.inv(in_link)
     grip = _grip(world, obstacles, held, to_world, np.asarray(q, np.float64))
     return dataclasses.replace(held, grip=grip)
 
@@ -173,7 +167,7 @@ def _grip(
     is_cut = (distances < own.radius[:, None]).any(axis=1)
     # They contain the object no more on that side: its corners there are checked beside them.
     in_object, radius = corners(held.obstacle.kind, held.obstacle.size)
-    link, in_link = _bodies(world.robot.value)[held.body]
+    link, in_link = moving_body(world.robot.value, held.body)
     found = _on_link(link, in_link @ pose_of(held.obstacle), in_object, radius)
     apart = np.linalg.norm(found.center[:, None] - own.center[is_cut], axis=-1)
     is_bare = (apart <= own.radius[is_cut] + TOLERANCE).any(axis=1)
@@ -228,30 +222,6 @@ def _checked(world: World, q: Any) -> np.ndarray:
             f"{', '.join(world.joint_names)}"
         )
     return q
-
-
-@functools.lru_cache(maxsize=8)
-def _model(robot: Any) -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_string(robot.xml)
-
-
-@functools.lru_cache(maxsize=8)
-def _bodies(robot: Any) -> dict[str, tuple[int, np.ndarray]]:
-    """The link of each body, and the body's pose (4, 4) in it, by name."""
-    model = _model(robot)
-    _, link, pose = chain_from_model(model)
-    return {model.body(k).name: (int(link[k]), pose[k]) for k in range(1, model.nbody)}
-
-
-def _body_pose(world: World, body: str, q: np.ndarray) -> np.ndarray:
-    """Pose (4, 4) of a body in the world at ``q`` (D,)."""
-    model = _model(world.robot.value)
-    data = mujoco.MjData(model)
-    data.qpos[:] = q
-    mujoco.mj_kinematics(model, data)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = data.body(body).xmat.reshape(3, 3), data.body(body).xpos
-    return pose
 
 
 def pose_of(obstacle: Obstacle) -> np.ndarray:

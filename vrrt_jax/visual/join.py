@@ -10,7 +10,7 @@ import numpy as np
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.compiling import host_jit
-from vrrt_jax.core.edges import first_free_edge, num_checks
+from vrrt_jax.core.edge_checks import first_free_edge, num_checks
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners import RRTConnect
 from vrrt_jax.core.result import EARLY_STOPS

@@ -20,7 +20,7 @@ import optax
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.compiling import host_jit
-from vrrt_jax.core.edges import num_checks
+from vrrt_jax.core.edge_checks import num_checks
 from vrrt_jax.core.types import Expansion, Goal, Proposals, Tree, pytree, static
 from vrrt_jax.scene.world import World
 from vrrt_jax.splat.lanes import map_lanes, one_of

@@ -16,7 +16,8 @@ import optax
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.compiling import host_jit
-from vrrt_jax.core.edges import difference, num_checks
+from vrrt_jax.core.edge_checks import num_checks
+from vrrt_jax.core.edges import difference
 from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.rewire import rewire
 from vrrt_jax.core.types import Expansion, Goal, Proposals, Tree, pytree, static

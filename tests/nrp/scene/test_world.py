@@ -16,7 +16,7 @@ from nrp_jax.scene.exact import ExactScene, merge_cells
 from nrp_jax.scene.link_shapes import segment_to_cylinder
 from nrp_jax.scene.near_cells import make_near_cells, touches
 from nrp_jax.scene.world import CarWorld
-from vrrt_jax.core.edges import free_prefix
+from vrrt_jax.core.edge_checks import free_prefix
 from vrrt_jax.core.planners.rrt import sample_configurations
 
 pytestmark = pytest.mark.light_compilation
@@ -211,11 +211,11 @@ def test_free_steps_against_single_checks(worlds):
     q = sample_configurations(world, jax.random.key(5), 400)
     q = q[np.asarray(nrp_jax.batch_is_free(world, q))][:16]
     q_from, q_to = q[:8], q[8:16]
-    passed, _ = jax.jit(free_prefix, static_argnums=3)(world, q_from, world.edge(q_from, q_to), 64)
+    passed, _ = jax.jit(free_prefix, static_argnums=3)(world, q_from, world.edge(q_from, q_to), 16)
     for a, b, count in zip(q_from, q_to, np.asarray(passed), strict=True):
-        points = interpolate(world, a[None], b[None], jnp.arange(1, 65) / 64)
+        points = interpolate(world, a[None], b[None], jnp.arange(1, 17) / 16)
         free = np.asarray(nrp_jax.batch_is_free(world, points))
-        assert count == (64 if free.all() else np.argmin(free))
+        assert count == (16 if free.all() else np.argmin(free))
 
 
 def test_merged_cells_are_the_cells(rng):

@@ -1,4 +1,4 @@
-"""Edges: steering, wrapping, free prefixes."""
+"""Edges: steering, wrapping, lengths."""
 
 import dataclasses
 
@@ -6,17 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from core_cases import GOAL, START
 
 import vrrt_jax
-from vrrt_jax.core.edges import (
-    difference,
-    first_free_edge,
-    free_prefix,
-    is_edge_free,
-    normalize,
-    steer,
-)
+from vrrt_jax.core.edges import difference, normalize, steer
 from vrrt_jax.core.planners import PLANNERS
 from vrrt_jax.scene.closed_form import ClosedFormWorld
 
@@ -31,54 +23,6 @@ def test_steering_respects_limits_length_and_wrapping(panda, wall_world):
     np.testing.assert_allclose(across, 2 * np.pi - 6.0, atol=1e-5)
     np.testing.assert_allclose(normalize(turning, jnp.full(7, 3.3)), 3.3 - 2 * np.pi, atol=1e-5)
     np.testing.assert_allclose(normalize(wall_world, jnp.full(7, 3.3)), 3.3)
-
-
-def test_free_steps_counts_the_leading_free_ones(wall_world, free):
-    points = START + np.linspace(0, 1, 65)[1:, None] * (GOAL - START)
-    is_free = np.asarray(free(wall_world, points.astype(np.float32)))
-    assert not is_free.all() and is_free[0]
-    start, goal = jnp.asarray(START)[None], jnp.asarray(GOAL)[None]
-    edge = wall_world.edge(start, goal)
-    count, _ = jax.jit(free_prefix, static_argnums=3)(wall_world, start, edge, 64)
-    assert int(count[0]) == int(np.argmin(is_free))
-
-
-class Counted(ClosedFormWorld):
-    """An ``is_free`` of one's own, so that no distance vouches for what was not looked at."""
-
-    def is_free(self, q):
-        return super().is_free(q)
-
-
-@pytest.mark.parametrize("kind", [ClosedFormWorld, Counted])
-@pytest.mark.parametrize(("num_steps", "length"), [(6, 0.12), (37, 0.7), (96, 3.0)])
-def test_few_checks_find_what_all_find(wall_world, free, rng, kind, num_steps, length):
-    world, step = kind(**vars(wall_world)), rng.normal(size=(40, 7))
-    edge = (length * step / np.linalg.norm(step, axis=1, keepdims=True)).astype(np.float32)
-    start = rng.uniform(wall_world.lower, wall_world.upper, (4000, 7)).astype(np.float32)
-    start = start[np.asarray(free(wall_world, start))][:40]
-    points = start[:, None] + edge[:, None] * np.arange(1, num_steps + 1)[:, None] / num_steps
-    is_free = np.asarray(free(wall_world, points.reshape(-1, 7).astype(np.float32)))
-    is_free = is_free.reshape(40, num_steps)
-    whole = is_free.all(axis=1)
-    assert 2 < whole.sum() < 40
-
-    @jax.jit
-    def ask(world, start, edge, tried):
-        return (
-            free_prefix(world, start, edge, num_steps),
-            is_edge_free(world, start, edge, num_steps),
-            first_free_edge(world, start, edge, num_steps, tried),
-        )
-
-    ends_free = is_free[:, -1]
-    (prefix, checked), (free_whole, checked_whole), first = ask(world, start, edge, ends_free)
-    # At least one check for each edge, unless distances vouch; never one twice.
-    assert 40 <= int(checked_whole) <= int(checked) <= 40 * num_steps
-    np.testing.assert_array_equal(prefix, np.cumprod(is_free, axis=1).sum(axis=1))
-    np.testing.assert_array_equal(free_whole, whole)
-    assert int(first) == int(np.argmax(whole))
-    assert int(ask(world, start, edge, ends_free & ~whole)[2]) == 40
 
 
 def test_what_a_distance_vouches_for_is_free(wall_world, free, rng):

@@ -7,7 +7,7 @@ import pytest
 
 import vrrt_jax
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import free_prefix, num_checks
+from vrrt_jax.core.edge_checks import free_prefix, num_checks
 from vrrt_jax.core.planners import RRTConnect
 from vrrt_jax.core.search import SearchResult, StopReason, make_termination, search
 from vrrt_jax.core.shortcut import path_length

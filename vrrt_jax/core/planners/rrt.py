@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import Space, num_checks
+from vrrt_jax.core.edge_checks import num_checks
+from vrrt_jax.core.edges import Space
 from vrrt_jax.core.goal import REACHED, ConfigurationGoal
 from vrrt_jax.core.types import Expansion, Proposals, PytreeSubclasses, Tree, pytree, static
 

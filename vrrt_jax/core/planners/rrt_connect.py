@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core import tree as trees
-from vrrt_jax.core.edges import Space, distance, num_checks
+from vrrt_jax.core.edge_checks import num_checks
+from vrrt_jax.core.edges import Space, distance
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static

@@ -5,7 +5,8 @@ from typing import Any, ClassVar, Self
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.edges import Space, num_checks
+from vrrt_jax.core.edge_checks import num_checks
+from vrrt_jax.core.edges import Space
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners.rrt import RRT
 from vrrt_jax.core.rewire import rewire
