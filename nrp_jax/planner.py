@@ -11,6 +11,7 @@ import numpy as np
 
 from nrp_jax.config import PlannerConfig
 from nrp_jax.homes.grid import Grid
+from nrp_jax.homes.top_view import TopView
 from nrp_jax.planners.by_name import PLANNERS, policy_of
 from nrp_jax.planners.nrp_connect import NRPConnect, default_planner, search_connect
 from nrp_jax.planners.restarts import search_with_restarts
@@ -101,7 +102,7 @@ def plan(
     q_goal = check_configuration(robot, world, goal.q, "goal")
     # All that follows is in the planners' own world.
     world, corner = working_world(world, goal)
-    places = _Places(corner=corner, start=q_start)
+    places = _Places(grid=grid, corner=corner, start=q_start)
     start, goal_q = (jnp.asarray(shifted(q, -corner), jnp.float32) for q in (q_start, q_goal))
     goal = dataclasses.replace(goal, q=goal_q)
     policy = policy_of(planner, robot, world, sampler, config)
@@ -176,6 +177,7 @@ def _searched(
 class _Places:
     """The way back from the planners' own world to the map."""
 
+    grid: Grid  # the map
     corner: np.ndarray  # (2,) of the map [m]
     start: np.ndarray  # (D,) as it was given
 
@@ -195,7 +197,7 @@ def _moved(result: PlanResult, places: _Places) -> PlanResult:
     paths = {n: places.of_path(getattr(result, n)) for n in ("path", "trajectory", "raw_path")}
     ends = {n: places.of(getattr(result, n)) for n in ("target", "alternatives")}
     tree = dataclasses.replace(result.tree, q=places.of(np.asarray(result.tree.q)))
-    return dataclasses.replace(result, tree=tree, **paths, **ends)
+    return dataclasses.replace(result, tree=tree, draw=TopView(places.grid), **paths, **ends)
 
 
 def _planner(

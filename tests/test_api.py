@@ -63,10 +63,11 @@ def test_the_readme_runs(index, tmp_path, monkeypatch):
 
 
 def test_the_documents_give_the_advice_that_plans_give():
-    page = (ROOT / "docs" / "your_own.md").read_text()
+    page = (ROOT / "docs" / "troubleshooting.md").read_text()
     for status, advice in ADVICE.items():
         if advice and status.name != "INTERRUPTED":
             assert f"| `{status.name}` | {status.value} | {advice} |" in page, status
+        assert f"\n## {status.name}\n" in page, status
 
 
 def test_the_python_of_the_documents_compiles():

@@ -1,6 +1,6 @@
 """Visual-RRT in JAX: from a picture of the goal to a verified, collision-free path."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 from vrrt_jax.gl import choose_backend as _choose_backend
 

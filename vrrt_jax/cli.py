@@ -201,15 +201,19 @@ def _motion_limits(arguments: argparse.Namespace, robot):
 
 
 def _pictures(problem, result, out: Path) -> None:
+    from concurrent.futures import ThreadPoolExecutor
+
     from vrrt_jax import viz
 
     written = ["result.json", "path.npz", "tree.npz"]
-    try:
-        viz.save_figure(problem, result, out / "figure.png")
-        written.append("figure.png")
-    except ModuleNotFoundError:
-        print("no figure: matplotlib is missing; pip install 'vrrt-jax[plot]'", file=sys.stderr)
-    viz.save_animation(problem, result, out / "animation.gif")
+    with ThreadPoolExecutor(1) as pool:  # what draws a scene leaves the other core to matplotlib
+        animation = pool.submit(viz.save_animation, problem, result, out / "animation.gif")
+        try:
+            viz.save_figure(problem, result, out / "figure.png")
+            written.append("figure.png")
+        except ModuleNotFoundError:
+            print("no figure: matplotlib is missing; pip install 'vrrt-jax[plot]'", file=sys.stderr)
+        animation.result()
     print(f"wrote {', '.join([*written, 'animation.gif'])} to {out}")
 
 

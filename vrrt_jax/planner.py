@@ -23,6 +23,7 @@ from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.world import World
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera
+from vrrt_jax.visual.end_picture import EndPicture
 from vrrt_jax.visual.goal import ImageGoal
 from vrrt_jax.visual.lineages import LineageRRT
 from vrrt_jax.visual.policy import VisualRRT
@@ -122,7 +123,8 @@ def plan(
         roots = np.stack([start, checks.check_limits(robot, q_guess, "guess")])
     if isinstance(problem, ConfigurationGoal):
         return plan_to_goal(robot, world, problem, policy, start, key, config, on_progress)
-    return plan_by_loss(robot, world, problem, policy, roots, key, config, on_progress)
+    result = plan_by_loss(robot, world, problem, policy, roots, key, config, on_progress)
+    return _drawn(result, goal, robot)
 
 
 @single_precision
@@ -263,9 +265,13 @@ def plan_batch(
         )
     if any(own is not worlds[0] for own in worlds):
         raise ValueError("goals known by their loss are searched for in one world; got several")
-    return plan_batch_by_loss(robot, worlds[0], checked, policy, starts, keys, config, on_progress)
+    results = plan_batch_by_loss(
+        robot, worlds[0], checked, policy, starts, keys, config, on_progress
+    )
+    return [_drawn(result, goal, robot) for result, goal in zip(results, goals, strict=True)]
 
 
+@single_precision
 def plan_waypoints(
     robot: Robot,
     world: World,
@@ -314,6 +320,12 @@ def plan_waypoints(
         if not legs[-1].ok:
             break
     return legs
+
+
+def _drawn(result: PlanResult, goal: AnyGoal, robot: Robot) -> PlanResult:
+    """A result that notebooks show with its goal image, if there is one."""
+    draw = EndPicture(goal, robot) if isinstance(goal, ImageGoal) else None
+    return dataclasses.replace(result, draw=draw)
 
 
 def _policy(

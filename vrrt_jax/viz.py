@@ -285,7 +285,7 @@ def _draw_tree(axes, result: PlanResult, joints: tuple[int, int], names: Sequenc
     score = np.log10(np.asarray(result.tree.score)[:size] + 1e-9)
     child = np.flatnonzero(parent >= 0)
     edges = np.stack([q[parent[child]], q[child]], axis=1)
-    lines = LineCollection(edges.tolist(), cmap="viridis_r", linewidths=0.6, alpha=0.7)
+    lines = LineCollection(list(edges), cmap="viridis_r", linewidths=0.6, alpha=0.7)
     lines.set_array(score[child])
     axes.add_collection(lines)
     path = result.path[:, joints]

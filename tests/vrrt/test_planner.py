@@ -36,6 +36,7 @@ def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
     assert result.ok and result.verification is not None and result.verification.ok
     assert np.abs(result.q_goal - Q_GOAL).mean() < 0.05
     np.testing.assert_allclose(result.path[0], Q_START, atol=1e-6)
+    assert result.draw.goal.image is image  # what notebooks show beside the end
     again = run()
     np.testing.assert_array_equal(result.path, again.path)
 
@@ -90,6 +91,7 @@ def test_batch_equals_single_plans(panda, self_model, camera, image, open_world)
         size = int(single.tree.size)
         assert int(batch[i].tree.size) == size
         assert batch[i].status is single.status
+        assert batch[i].draw.goal.image is goal
         # Sums of floats differ in order, and sign-like Adam steps amplify it: compare early nodes.
         np.testing.assert_allclose(batch[i].tree.q[:80], single.tree.q[:80], atol=1e-3)
 

@@ -3,10 +3,11 @@
 import dataclasses
 import enum
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
+from vrrt_jax.core.result_html import result_html
 from vrrt_jax.core.search import SearchResult, StopReason
 from vrrt_jax.core.types import Rejection, Tree
 
@@ -44,6 +45,19 @@ class Verification:
     contact: str | None  # the first violation, such as "link5 touches box_2 at 37 % of the path"
     clearance: float = float("nan")  # smallest distance to obstacles, where it is measured [m]
     geometry: str = "primitives"  # what the robot was made of, or "meshes", or "spheres"
+
+
+class Drawing(Protocol):
+    """What draws a result for notebooks."""
+
+    @property
+    def caption(self) -> str:
+        """What the picture shows."""
+        ...
+
+    def __call__(self, result: "PlanResult") -> np.ndarray:
+        """The picture, (H, W, 3) uint8."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
@@ -88,6 +102,9 @@ class PlanResult:
     # Of the length of ``raw_path``, what ``tree`` and an edge from it led along. RRT-Connect, which
     # goes on from the tree where no such edge is free, found the rest.
     tree_share: float = 1.0
+    # For notebooks: the goal image beside the end of the path, or the way through a home. None
+    # where nothing is to be seen, as of joint goals.
+    draw: Drawing | None = None
 
     @property
     def ok(self) -> bool:
@@ -110,6 +127,10 @@ class PlanResult:
             f"{int(self.tree.size)} nodes; "
             f"{times}{ambiguous}"
         )
+
+    def _repr_html_(self) -> str:
+        """The same for notebooks, with a picture."""
+        return result_html(self)
 
 
 def rejected_lanes(found: SearchResult) -> dict[str, int]:
