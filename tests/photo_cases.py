@@ -1,11 +1,16 @@
 """Photographs as users have them: rendered, before a background, through a lens."""
 
 import io
+import json
 
 import cv2
 import numpy as np
 from PIL import Image
 from scipy import ndimage
+
+from vrrt_jax.bench.dream_data import body_places
+from vrrt_jax.splat.camera import project
+from vrrt_jax.splat.mujoco_images import Picture
 
 
 def clutter(height, width, seed=0):
@@ -17,6 +22,15 @@ def clutter(height, width, seed=0):
     ]
     mixed = sum((layer - layer.mean()) / layer.std() for layer in layers) / 3
     return np.clip(0.45 + 0.16 * mixed, 0.02, 0.98).astype(np.float32)
+
+
+def thing(height, width):
+    """A picture (without OpenGL) of a bright, striped thing, in soft light."""
+    y, x = np.mgrid[:height, :width] / height
+    alpha = ((np.abs(x - 0.6) < 0.1) & (y > 0.2)) | (np.hypot(x - 0.85, y - 0.3) < 0.16)
+    shade = 0.95 - 0.5 * (np.abs(y - 0.6) < 0.04) - 0.15 * x
+    rgb = (alpha * shade)[..., None] * np.array([1.0, 0.99, 0.95])
+    return Picture(rgb=rgb.astype(np.float32), alpha=alpha.astype(np.float32), valid=alpha)
 
 
 def before(picture, background):
@@ -51,3 +65,43 @@ def overlap(mask, true_alpha):
     """Intersection over union of a mask and what the robot covers."""
     mask, true_alpha = mask > 0.5, true_alpha > 0.5
     return (mask & true_alpha).sum() / (mask | true_alpha).sum()
+
+
+def dream_folder(folder, robot, camera, shots, *, jpeg=90):
+    """Write a folder in DREAM's format.
+
+    Args:
+        folder: where to.
+        robot: of the pictures.
+        camera: of all of them.
+        shots: for each frame q, its image (H, W, 3) of 8 bits, and the robot's mask or None.
+        jpeg: quality.
+    """
+    folder.mkdir(exist_ok=True)
+    focal, size = float(camera.focal), {"width": camera.width, "height": camera.height}
+    cx, cy = np.asarray(camera.principal_point, float) - 0.5
+    inner = {"fx": focal, "fy": focal, "cx": cx, "cy": cy, "resolution": size}
+    settings = {"camera_settings": [{"intrinsic_settings": inner, "captured_image_size": size}]}
+    (folder / "_camera_settings.json").write_text(json.dumps(settings))
+    marked = ("link0", "link2", "link3", "link4", "link6", "link7", "hand")
+    for index, (q, image, mask) in enumerate(shots):
+        places = body_places(robot, q)
+        pixels, _ = project(camera, np.array([places[name] for name in marked], np.float32))
+        keypoints = [
+            {"name": f"panda_{name}", "projected_location": (np.asarray(p, float) - 0.5).tolist()}
+            for name, p in zip(marked, pixels, strict=True)
+        ]
+        joints = [
+            {"name": f"panda_{name}", "position": float(value)}
+            for name, value in zip(robot.joint_names, q, strict=True)
+        ]
+        joints.append({"name": "panda_finger_joint1", "position": 0.04})
+        fields = {
+            "objects": [{"class": "panda", "keypoints": keypoints}],
+            "sim_state": {"joints": joints},
+        }
+        (folder / f"{index:06}.json").write_text(json.dumps(fields))
+        Image.fromarray(image).save(folder / f"{index:06}.rgb.jpg", quality=jpeg)
+        if mask is not None:
+            white = Image.fromarray((255 * (mask > 0.5)).astype(np.uint8))
+            white.save(folder / f"{index:06}.mask.png")

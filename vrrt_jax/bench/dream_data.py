@@ -49,7 +49,7 @@ def frame_names(folder: str | Path) -> list[str]:
     names = sorted(file.stem for file in Path(folder).glob("[0-9]*.json"))
     if not names:
         raise FileNotFoundError(
-            f"no frames in '{folder}'; expected files NNNNNN.json and NNNNNN.rgb.jpg, and {SETTINGS}"
+            f"no frames in '{folder}'; expected NNNNNN.json and NNNNNN.rgb.jpg, and {SETTINGS}"
         )
     return names
 

@@ -59,15 +59,15 @@ def robot_before_background(image: Any, background: Any) -> np.ndarray:
     sure, likely = (max(a, b * noise) for a, b in zip((SURE, LIKELY), OF_NOISE, strict=True))
     is_robot = ndimage.binary_propagation(apart > sure, mask=apart > likely)
     is_robot = without_specks(_sharpened(np.asarray(is_robot, bool), apart), apart, noise)
-    if is_robot.mean() < MIN_COVERED:
-        raise ValueError(
-            "the goal image hardly differs from its background; give a background without the "
-            "robot, and a goal image with it"
-        )
     if noise > MAX_NOISE or is_robot.mean() > MAX_COVERED:
         raise ValueError(
             f"{100 * is_robot.mean():.0f} % of the goal image differ from the background, by a "
             f"noise of {noise:.2g} of 1; take both from the same place, in the same light"
+        )
+    if is_robot.mean() < MIN_COVERED:
+        raise ValueError(
+            "the goal image hardly differs from its background; give a background without the "
+            "robot, and a goal image with it"
         )
     return is_robot.astype(np.float32)
 

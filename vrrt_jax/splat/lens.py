@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+from scipy import ndimage
 
 from vrrt_jax.core.opencv import load_opencv
 
@@ -59,4 +60,8 @@ class Lens:
 def _is_one_to_one(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Where the map (H, W) from pinhole to real pixels does not fold back, as polynomials do."""
     (x_down, x_right), (y_down, y_right) = np.gradient(x), np.gradient(y)
-    return x_right * y_down > x_down * y_right
+    is_kept = (x_right > 0) & (y_down > 0) & (x_right * y_down > x_down * y_right)
+    parts = np.zeros(x.shape, np.int32)
+    ndimage.label(is_kept, output=parts)
+    # What is beyond a fold is another part, wherever it lies.
+    return is_kept & (parts == parts[x.shape[0] // 2, x.shape[1] // 2])
