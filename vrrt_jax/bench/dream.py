@@ -242,11 +242,16 @@ def _goal_image(benchmark: DreamBenchmark, frame: Frame, camera: Camera) -> np.n
 
 def robot_box(robot: Robot, q: np.ndarray, camera: Camera) -> list[float]:
     """A box x0, y0, x1, y1 [px] around the robot at a configuration (D,), inside the image."""
-    spheres = robot.self_collision_spheres
-    poses = np.asarray(link_poses(robot.chain, jnp.asarray(q)))[np.asarray(spheres.link)]
-    centers = np.einsum("nij,nj->ni", poses[:, :3, :3], spheres.center) + poses[:, :3, 3]
+    # These cover the moving links; those follow the base too.
+    both = robot.collision_spheres, robot.self_collision_spheres
+    link, offset, radius = (
+        np.concatenate([np.asarray(getattr(spheres, name)) for spheres in both])
+        for name in ("link", "center", "radius")
+    )
+    poses = np.asarray(link_poses(robot.chain, jnp.asarray(q)))[link]
+    centers = np.einsum("nij,nj->ni", poses[:, :3, :3], offset) + poses[:, :3, 3]
     pixels, depth = (np.asarray(x) for x in project(camera, jnp.asarray(centers)))
-    reach = float(camera.focal) * np.asarray(spheres.radius) / np.maximum(depth, 0.01) + BOX_RIM_PX
+    reach = float(camera.focal) * radius / np.maximum(depth - radius, 0.01) + BOX_RIM_PX
     size = [camera.width, camera.height]
     low, high = (pixels - reach[:, None]).min(axis=0), (pixels + reach[:, None]).max(axis=0)
     return [*np.clip(low, 0, size).tolist(), *np.clip(high, 0, size).tolist()]

@@ -25,7 +25,7 @@ SETTINGS = "_camera_settings.json"
 IMAGES = (".rgb.jpg", ".rgb.png")
 MASK = ".mask.png"  # beside a frame, white on the robot; no part of the published data
 MIN_KEYPOINTS = 4
-MAX_REPROJECTION_PX = 8.0  # mean distance of keypoints from where the pose puts them
+MAX_REPROJECTION_PX = 4.0  # mean distance of keypoints from where the pose puts them
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

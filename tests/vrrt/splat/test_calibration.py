@@ -1,5 +1,8 @@
 """Calibrations of OpenCV and ROS: read rightly in every spelling, or refused by name."""
 
+import re
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -53,6 +56,9 @@ MESSAGE = {
     "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
     "world_to_camera": POSE.tolist(),
 }
+
+
+PAGE = Path(__file__).parents[3] / "docs" / "your_photograph.md"
 
 
 def without(fields, *names):
@@ -200,3 +206,18 @@ def test_extrinsics_of_their_own_are_checked():
         with_extrinsics([1], {"camera_to_world": INVERSE.tolist()})
     with pytest.raises(ValueError, match="has distortion"):
         camera_from_dict(OPENCV, SIZE)
+
+
+def test_the_cameras_of_the_documents_are_one_camera(tmp_path):
+    blocks = re.findall(r"```(yaml|json)\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    read = []
+    for index, (kind, text) in enumerate(blocks):
+        file = tmp_path / f"{index}.{kind}"
+        file.write_text(text)
+        read.append(read_fields(file))
+    opencv, with_pose, message, pose = read
+    expected, _ = camera_and_lens(with_pose, SIZE)
+    for fields in (opencv, message):
+        camera, lens = camera_and_lens(with_extrinsics(fields, pose), SIZE)
+        np.testing.assert_allclose(camera.world_to_cam, expected.world_to_cam, atol=1e-4)
+        np.testing.assert_allclose(lens.coefficients, [-0.32, 0.12, 0.0006, -0.0004, -0.015])
