@@ -253,7 +253,7 @@ def _arm(arguments: argparse.Namespace) -> int:
 
 
 def _dream(arguments: argparse.Namespace) -> int:
-    from vrrt_jax.bench import dream
+    from vrrt_jax.bench import dream, dream_table
     from vrrt_jax.config import PlannerConfig
 
     names = ("folder", "robot", "limit", "mask", "background", "extrinsics", "engine", "seed")
@@ -262,7 +262,7 @@ def _dream(arguments: argparse.Namespace) -> int:
         config=PlannerConfig().changed({"budget.time_limit_s": arguments.time_limit}),
         **{name: getattr(arguments, name) for name in names},
     )
-    print(dream.to_text(dream.run(benchmark, arguments.json, jobs=arguments.jobs)))
+    print(dream_table.to_text(dream.run(benchmark, arguments.json, jobs=arguments.jobs)))
     return EXIT_SOLVED
 
 

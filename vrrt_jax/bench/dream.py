@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import time
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,12 @@ from vrrt_jax import planner
 from vrrt_jax.bench import dream_data
 from vrrt_jax.bench.arm import evenly
 from vrrt_jax.bench.dream_data import Frame
+from vrrt_jax.bench.dream_table import summarize
 from vrrt_jax.bench.tasks import bench_robot, bench_world, level_name
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.data_file import read_fields
 from vrrt_jax.core.edges import joint_error
 from vrrt_jax.core.interrupt import uninterrupted
-from vrrt_jax.core.markdown import table
 from vrrt_jax.core.results_file import fingerprint, plain, resume, write
 from vrrt_jax.core.timing import machine, versions
 from vrrt_jax.core.workers import in_processes
@@ -260,47 +260,3 @@ def robot_box(robot: Robot, q: np.ndarray, camera: Camera) -> list[float]:
 @functools.cache
 def _self_model(robot: str) -> SelfModel:
     return load_self_model(self_model_path(bench_robot(robot)))
-
-
-def summarize(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """What is told of each level: errors by joint and of all [rad], matches, times."""
-    levels = []
-    for level in sorted({row["level"] for row in rows}):
-        own = [row for row in rows if row["level"] == level]
-        read = [row for row in own if "refused" not in row]
-        summary: dict[str, Any] = {"level": level, "n": len(read), "refused": len(own) - len(read)}
-        if read:
-            errors = np.array([row["error_rad"] for row in read])
-            times = [row["time_s"] for row in read]
-            summary |= {
-                "by_joint_rad": np.round(errors.mean(axis=0), 4).tolist(),
-                "last_rad": round(float(errors[:, -1].mean()), 4),
-                "others_rad": round(float(errors[:, :-1].mean()), 4),
-                "mean_rad": round(float(errors.mean()), 4),
-                "median_rad": round(float(np.median(errors.mean(axis=1))), 4),
-                "matched": sum(row["matched"] for row in read),
-                "median_time_s": round(float(np.median(times)), 3),
-            }
-        levels.append(summary)
-    return levels
-
-
-def to_text(results: Mapping[str, Any]) -> str:
-    """A Markdown table with a row for each level, and why frames were refused."""
-    filled = [level for level in results["levels"] if level["n"]]
-    joints = len(filled[0]["by_joint_rad"]) if filled else 0
-    heads = [
-        *("start [rad]", "n", "refused", *(f"J{j + 1}" for j in range(joints))),
-        *("all but the last", "mean [rad]", "median [rad]", "matched", "median time [s]"),
-    ]
-    rows = [
-        [
-            *(f"{level['level']:g}", str(level["n"]), str(level["refused"])),
-            *(f"{value:.3f}" for value in level["by_joint_rad"]),
-            *(f"{level[name]:.3f}" for name in ("others_rad", "mean_rad", "median_rad")),
-            *(str(level["matched"]), f"{level['median_time_s']:.2f}"),
-        ]
-        for level in filled
-    ]
-    notes = [f"{r['frame']}: {r['refused']}" for r in results["rows"] if "refused" in r]
-    return "\n".join([table(heads, rows), *([""] if notes else []), *notes])

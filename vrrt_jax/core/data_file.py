@@ -19,7 +19,16 @@ def read_fields(path: str | Path) -> Any:
         FileNotFoundError: no such file.
         ValueError: it is damaged, or a field is there twice.
     """
-    return read_yaml(path) if Path(path).suffix.lower() in YAML else read_json(path)
+    suffix = Path(path).suffix.lower()
+    if suffix in YAML:
+        return read_yaml(path)
+    try:
+        return read_json(path)
+    except ValueError as error:
+        if suffix == ".json":
+            raise
+        advice = "give JSON, or YAML in a file that is named .yaml or .yml"
+        raise ValueError(f"{error}; {advice}") from None
 
 
 def read_json(path: str | Path) -> Any:

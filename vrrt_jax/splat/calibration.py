@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from vrrt_jax.core.fields import check_fields
+from vrrt_jax.splat.calibration_numbers import coefficient_row, matrix_of
 from vrrt_jax.splat.camera import camera_from_matrix
 from vrrt_jax.splat.extrinsics import POSES, world_to_camera
 from vrrt_jax.splat.lens import FISHEYE, LENGTHS, RATIONAL, Lens
@@ -40,6 +41,7 @@ MODELS = {
     "equidistant": (FISHEYE, LENGTHS[FISHEYE]),
     "fisheye": (FISHEYE, LENGTHS[FISHEYE]),
 }
+MIDDLE = 0.05, 0.95  # where principal points are, in units of the image
 NO_MODEL = ("", "none")  # as ROS says it of cameras without distortion
 ADVICE = {
     **dict.fromkeys(
@@ -77,8 +79,9 @@ def calibrated(fields: Mapping[str, Any], size: tuple[int, ...]) -> tuple[Camera
     read = {name: _one_of(fields, names) for name, names in NAMES.items()}
     scale = _scale(read, size)
     _check_plain(read)
-    matrix = _camera_matrix(_matrix(read["camera_matrix"], (3, 3), "camera_matrix"))
+    matrix = _camera_matrix(matrix_of(read["camera_matrix"], (3, 3), "camera_matrix"))
     is_rectified = _truth(read["rectified"], "rectified")
+    _check_middle(matrix, read)
     model, coefficients = (RATIONAL, np.zeros(0)) if is_rectified else _distortion(read)
     straight = _projection(read["projection_matrix"])
     # An image without distortion stays as it was taken.
@@ -160,7 +163,7 @@ def _check_plain(read: Mapping[str, Any]) -> None:
         )
     turn = read["rectification_matrix"]
     if turn is not None:
-        turn = _matrix(turn, (3, 3), "rectification_matrix")
+        turn = matrix_of(turn, (3, 3), "rectification_matrix")
         if turn.any() and not np.allclose(turn, np.eye(3), atol=1e-6):
             raise ValueError(
                 "rectification_matrix turns the camera, as that of a stereo pair does; expected "
@@ -185,11 +188,22 @@ def _camera_matrix(matrix: np.ndarray) -> np.ndarray:
     return matrix
 
 
+def _check_middle(matrix: np.ndarray, read: Mapping[str, Any]) -> None:
+    """Raise a ValueError for the camera matrix (3, 3) of an image of another size."""
+    size = np.array([read["image_width"], read["image_height"]], float)
+    low, high = MIDDLE[0] * size, MIDDLE[1] * size
+    if np.any((matrix[:2, 2] < low) | (matrix[:2, 2] > high)):
+        raise ValueError(
+            f"camera_matrix has its principal point at {matrix[:2, 2].tolist()}, at the rim of an "
+            f"image of {size[0]:g}x{size[1]:g} px or outside; give the calibration of this size"
+        )
+
+
 def _projection(value: Any) -> np.ndarray | None:
     """The pinhole camera (3, 3) of the image without distortion; None if the file has none."""
     if value is None:
         return None
-    matrix = _matrix(value, (3, 4), "projection_matrix")
+    matrix = matrix_of(value, (3, 4), "projection_matrix")
     if not matrix.any():
         return None  # as drivers leave it that know none
     if matrix[:, 3].any():
@@ -215,7 +229,7 @@ def _distortion(read: Mapping[str, Any]) -> tuple[str, np.ndarray]:
             "the calibration says nothing of distortion; give distortion_coefficients, [] if there "
             'is none, or "rectified": true if the image has lost it'
         )
-    coefficients = _coefficients(value)
+    coefficients = coefficient_row(value)
     if not coefficients.any():
         return RATIONAL, np.zeros(0)
     if named in MODELS:
@@ -237,47 +251,6 @@ def _distortion(read: Mapping[str, Any]) -> tuple[str, np.ndarray]:
             f"{' or '.join(map(str, lengths))} for {named or 'OpenCV'}"
         )
     return model, coefficients
-
-
-def _coefficients(value: Any) -> np.ndarray:
-    """Distortion coefficients (n,), from a list, a row or a column."""
-    array = _array(value, "distortion_coefficients")
-    if array.ndim > 2 or (array.ndim == 2 and 1 not in array.shape):
-        raise ValueError(
-            f"distortion_coefficients have shape {array.shape}; expected one row: k1, k2, p1, p2, "
-            "k3"
-        )
-    return array.ravel()
-
-
-def _matrix(value: Any, shape: tuple[int, int], name: str) -> np.ndarray:
-    """A matrix, also from its rows one after the other."""
-    array = _array(value, name)
-    if array.shape != shape and array.shape != (shape[0] * shape[1],):
-        raise ValueError(f"{name} has shape {array.shape}; expected {shape}")
-    return array.reshape(shape)
-
-
-def _array(value: Any, name: str) -> np.ndarray:
-    """Finite numbers from lists, or from OpenCV's object with rows, cols and data."""
-    shape: tuple[int, ...] | None = None
-    is_opencv = isinstance(value, Mapping)
-    if is_opencv:
-        check_fields(value, ("rows", "cols", "data", "dt", "type_id"), name)
-    try:
-        if is_opencv:
-            shape, value = (int(value["rows"]), int(value["cols"])), value["data"]
-        array = np.asarray(value, np.float64)
-        array = array if shape is None else array.reshape(shape)
-    except KeyError as error:
-        raise ValueError(f"{name} lacks {error}; expected rows, cols and data") from None
-    except (TypeError, ValueError):
-        raise ValueError(
-            f"{name} is no matrix; expected lists of numbers, or rows, cols and data that fit"
-        ) from None
-    if not np.all(np.isfinite(array)):
-        raise ValueError(f"{name} has numbers that are not finite; calibrate again")
-    return array
 
 
 def _scaled(matrix: np.ndarray, scale: float) -> np.ndarray:

@@ -10,7 +10,7 @@ from pictures import HALF_TURNED, Q_GOAL, QUICK, picture
 from PIL import Image
 
 import vrrt_jax
-from vrrt_jax.bench import dream, dream_data
+from vrrt_jax.bench import dream, dream_data, dream_table
 from vrrt_jax.cli import main
 from vrrt_jax.problems import self_model_path
 from vrrt_jax.splat.camera import project
@@ -101,7 +101,7 @@ def test_frames_are_planned_to_and_gone_on_with(folder, tmp_path):
     assert (level["n"], level["refused"], level["matched"]) == (1, 1, 1)
     assert level["last_rad"] == pytest.approx(good["error_rad"][-1], abs=1e-3)
     assert level["mean_rad"] == pytest.approx(np.mean(good["error_rad"]), abs=1e-3)
-    text = dream.to_text(results)
+    text = dream_table.to_text(results)
     assert "| 0.5 | 1 | 1 |" in text and "| J7 |" in text and "000001: " in text
     assert json.loads(file.read_text()) == results
     assert dream.run(benchmark, file)["rows"] == results["rows"]  # nothing is planned again

@@ -48,6 +48,12 @@ def test_other_files_are_explained(tmp_path, text, message):
         read_fields(file)
 
 
+def test_what_is_neither_json_nor_yaml_is_told_what_to_be(tmp_path):
+    (tmp_path / "camera.xml").write_text("<opencv_storage/>")
+    with pytest.raises(ValueError, match="not valid JSON: .*; give JSON, or YAML in a file"):
+        read_fields(tmp_path / "camera.xml")
+
+
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(FileNotFoundError, match="cannot read"):
         read_fields(tmp_path / "none.yaml")

@@ -166,6 +166,7 @@ def test_a_resized_image_has_to_be_told():
         (OPENCV | {"camera_matrix": np.zeros((3, 3)).tolist()}, "not calibrated"),
         (OPENCV | {"camera_matrix": [[610, 3, 330], *MATRIX[1:]]}, "without skew"),
         (OPENCV | {"camera_matrix": [[np.nan, 0, 330], *MATRIX[1:]]}, "not finite"),
+        (OPENCV | {"camera_matrix": [[1220, 0, 661], [0, 1210, 473], [0, 0, 1]]}, "at the rim of"),
         (OPENCV | {"K": MATRIX}, "camera_matrix and K, which mean the same"),
         (OPENCV | {"distortion_coefficients": D5[:3]}, "got 3 distortion .* 5 or 8 or 12 or 14"),
         (OPENCV | {"distortion_coefficients": D5[:4]}, "of a usual lens, or .* fisheye; say"),
