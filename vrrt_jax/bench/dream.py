@@ -106,7 +106,10 @@ def run(benchmark: DreamBenchmark, file: str | Path | None, *, jobs: int = 1) ->
     results = {**benchmark.header(), "machine": machine(), "rows": []}
     if file is not None:
         results = resume(Path(file), benchmark.header(), results)
-    done = {(row["frame"], row["level"]): row for row in results["rows"]}
+    # What was refused is tried again: its files may have been mended.
+    results["rows"] = [row for row in results["rows"] if "refused" not in row]
+    _check_done(benchmark.folder, results["rows"])
+    done = {(row["frame"], row["level"]) for row in results["rows"]}
     todo = [
         (name, level)
         for name in benchmark.frames
@@ -122,6 +125,16 @@ def run(benchmark: DreamBenchmark, file: str | Path | None, *, jobs: int = 1) ->
             bar.update()
     results["levels"] = summarize(results["rows"])
     return results
+
+
+def _check_done(folder: str, rows: list[dict[str, Any]]) -> None:
+    """Raise a ValueError for a row whose frame has changed since."""
+    for name, old in {row["frame"]: row["fingerprint"] for row in rows}.items():
+        if dream_data.frame_fingerprint(folder, name) != old:
+            raise ValueError(
+                f"frame {name} has changed since it was run: results of different files are not "
+                "mixed; choose another --json"
+            )
 
 
 def _check(benchmark: DreamBenchmark) -> None:

@@ -82,19 +82,36 @@ def load_frame(folder: str | Path, name: str, robot: Robot) -> Frame:
         )
     if any(p.shape != (2,) or not np.all(np.isfinite(p)) for p in keypoints.values()):
         raise ValueError(f"'{file}' has keypoints whose projected_location is not two numbers")
-    found = [file.with_name(name + suffix) for suffix in IMAGES]
-    image = next((path for path in found if path.is_file()), None)
-    if image is None:
-        raise FileNotFoundError(f"no image beside '{file}'; expected {found[0].name}")
-    mask = file.with_name(name + MASK)
+    image, mask = _pictures(folder, name)
     return Frame(
         name=name,
         image=image,
-        mask=mask if mask.is_file() else None,
+        mask=mask,
         q=check_limits(robot, [joints[joint] for joint in robot.joint_names], f"pose in '{file}'"),
         keypoints=keypoints,
-        fingerprint=fingerprint(file) + fingerprint(image),
+        fingerprint=frame_fingerprint(folder, name),
     )
+
+
+def frame_fingerprint(folder: str | Path, name: str) -> str:
+    """Of what is in a frame's files.
+
+    Raises:
+        OSError: one is missing.
+    """
+    image, mask = _pictures(folder, name)
+    files = [Path(folder) / f"{name}.json", image, *([mask] if mask else [])]
+    return "-".join(fingerprint(file) for file in files)
+
+
+def _pictures(folder: str | Path, name: str) -> tuple[Path, Path | None]:
+    """The files of a frame's image and mask; None for a mask that is not there."""
+    found = [Path(folder) / (name + suffix) for suffix in IMAGES]
+    image = next((path for path in found if path.is_file()), None)
+    if image is None:
+        raise FileNotFoundError(f"no image of frame {name}; expected '{found[0]}'")
+    mask = Path(folder) / (name + MASK)
+    return image, mask if mask.is_file() else None
 
 
 def load_intrinsics(folder: str | Path) -> tuple[np.ndarray, tuple[int, int]]:

@@ -108,6 +108,11 @@ def test_frames_are_planned_to_and_gone_on_with(folder, tmp_path):
     changed = dream.DreamBenchmark(**vars(benchmark) | {"seed": 1})
     with pytest.raises(ValueError, match="has seed 0, this run 1"):
         dream.run(changed, file)
+    rows = json.loads(file.read_text())
+    rows["rows"][0]["fingerprint"] = "another"
+    file.write_text(json.dumps(rows))
+    with pytest.raises(ValueError, match="frame 000000 has changed since"):
+        dream.run(benchmark, file)
 
 
 @pytest.mark.parametrize(
@@ -170,5 +175,5 @@ def test_other_folders_are_explained(folder, tmp_path, panda, capsys):
         dream_data.load_frame(tmp_path, "000000", panda)
     fields["sim_state"]["joints"] = joints
     (tmp_path / "000000.json").write_text(json.dumps(fields))
-    with pytest.raises(FileNotFoundError, match="no image beside"):
+    with pytest.raises(FileNotFoundError, match="no image of frame 000000"):
         dream_data.load_frame(tmp_path, "000000", panda)
