@@ -53,7 +53,9 @@ from vrrt_jax.scene.world import (  # noqa: E402
     with_obstacles,
 )
 from vrrt_jax.splat.camera import camera_from_matrix, look_at, orbit  # noqa: E402
+from vrrt_jax.splat.foreground import robot_before_background, robot_in_box  # noqa: E402
 from vrrt_jax.splat.model import SelfModel, load_self_model, save_self_model  # noqa: E402
+from vrrt_jax.splat.photo import Photo, load_photo  # noqa: E402
 from vrrt_jax.splat.picture_file import read_image, write_image  # noqa: E402
 from vrrt_jax.splat.raster import render  # noqa: E402
 from vrrt_jax.splat.types import Camera, GoalImage, SplatModel  # noqa: E402
@@ -80,6 +82,7 @@ __all__ = [
     "MotionLimits",
     "Obstacle",
     "PLANNERS",
+    "Photo",
     "PlanResult",
     "PlannerConfig",
     "PolishConfig",
@@ -110,6 +113,7 @@ __all__ = [
     "inverse_kinematics",
     "is_free",
     "link_poses",
+    "load_photo",
     "load_problem",
     "load_robot",
     "load_self_model",
@@ -130,6 +134,8 @@ __all__ = [
     "pytree",
     "read_image",
     "render",
+    "robot_before_background",
+    "robot_in_box",
     "robot_names",
     "save_self_model",
     "save_trajectory",

@@ -12,6 +12,7 @@ from vrrt_jax.core import command
 from vrrt_jax.core.command import EXIT_SOLVED, EXIT_UNSOLVED
 
 LARGEST_SIDE = 8192  # of an image that is drawn [px]
+PHOTO = ("extrinsics", "robot_mask", "background", "box")  # what is told of each goal image
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,7 +33,10 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--world", help="an MJCF file of obstacles, or a packaged world")
     plan.add_argument("--engine", default="mjx", help="collision checks: mjx, closed_form")
     plan.add_argument("--goal", nargs="+", help="goal images, RGB with mask or plain background")
-    plan.add_argument("--camera", nargs="+", help="a JSON file for each goal image")
+    plan.add_argument(
+        "--camera", nargs="+", help="a JSON or YAML file for each goal image: OpenCV's, ROS's, ours"
+    )
+    _add_photo(plan)
     plan.add_argument(
         "--start", type=command.numbers, help="start configuration, as --start=0,0.3,..."
     )
@@ -61,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument(
         "--q", type=command.numbers, required=True, help="configuration, as --q=0,0.3,..."
     )
-    render.add_argument("--camera", required=True, help="a JSON file")
+    render.add_argument("--camera", required=True, help="a JSON or YAML file")
     render.add_argument("--size", type=_size, default=(480, 480), help="WIDTHxHEIGHT [px]")
     render.add_argument("--out", required=True, help="a .png file")
 
@@ -121,6 +125,28 @@ def _parser() -> argparse.ArgumentParser:
     doctor = commands.add_parser("doctor", help="say what this machine has, and what it lacks")
     doctor.set_defaults(run=_doctor)
     return parser
+
+
+def _add_photo(parser: argparse.ArgumentParser) -> None:
+    """Add what else is told of each goal image."""
+    parser.add_argument(
+        "--extrinsics",
+        nargs="+",
+        help="a file for each goal image with camera_to_world or world_to_camera, where its "
+        "camera's file has none",
+    )
+    parser.add_argument(
+        "--robot-mask", nargs="+", help="a picture for each goal image, white on the robot"
+    )
+    parser.add_argument(
+        "--background", nargs="+", help="what the camera of each goal image sees without the robot"
+    )
+    parser.add_argument(
+        "--box",
+        nargs="+",
+        type=_box,
+        help="around the robot in each goal image, as --box x0,y0,x1,y1 [px]",
+    )
 
 
 def _plan(arguments: argparse.Namespace) -> int:
@@ -221,12 +247,13 @@ def _problem(arguments: argparse.Namespace):
     from vrrt_jax import checks, problems
     from vrrt_jax.robots import load_robot
     from vrrt_jax.splat.model import load_self_model
-    from vrrt_jax.splat.picture_file import read_image
+    from vrrt_jax.splat.photo import load_photo
 
     parts = ("robot", "world", "goal", "camera", "start")
     given = [name for name in parts if getattr(arguments, name) is not None]
     if arguments.problem is not None:
-        given += [name for name in ("self_model", "freeze") if getattr(arguments, name) is not None]
+        others = ("self_model", "freeze", *PHOTO)
+        given += [name for name in others if getattr(arguments, name) is not None]
         if given:
             options = ", --".join(given).replace("_", "-")
             raise ValueError(f"give either --problem or --{options}, not both")
@@ -237,23 +264,27 @@ def _problem(arguments: argparse.Namespace):
             f"missing --{', --'.join(missing)}; or give --problem with one of "
             f"{', '.join(problems.problem_names())}"
         )
-    if len(arguments.goal) != len(arguments.camera):
-        raise ValueError(
-            f"{len(arguments.goal)} goal images but {len(arguments.camera)} cameras; give as many"
-        )
+    goals = len(arguments.goal)
+    told: dict[str, list[Any]] = {
+        name: getattr(arguments, name) or [None] * goals for name in ("camera", *PHOTO)
+    }
+    for name, values in told.items():
+        if len(values) != goals:
+            raise ValueError(
+                f"{goals} goal images but {len(values)} of --{name.replace('_', '-')}; give as many"
+            )
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
     checks.check_limits(robot, arguments.start, "start")
-    images = tuple(read_image(path) for path in arguments.goal)
+    photos = [
+        load_photo(path, **{name: values[index] for name, values in told.items()})
+        for index, path in enumerate(arguments.goal)
+    ]
     return problems.Problem(
         name=Path(arguments.goal[0]).stem,
         robot=robot,
         world=problems.load_world(arguments.world, robot, engine=arguments.engine),
         self_model=load_self_model(problems.self_model_path(robot, arguments.self_model)),
-        cameras=tuple(
-            problems.camera_from_dict(problems.read_json(path), image.shape[:2])
-            for path, image in zip(arguments.camera, images, strict=True)
-        ),
-        goal_images=images,
+        **problems.views_of(photos),
         q_start=arguments.start,
         true_goal=None,
     )
@@ -262,14 +293,16 @@ def _problem(arguments: argparse.Namespace):
 def _render(arguments: argparse.Namespace) -> int:
     import numpy as np
 
-    from vrrt_jax import checks, problems
+    from vrrt_jax import checks
+    from vrrt_jax.core.data_file import read_fields
     from vrrt_jax.robots import load_robot
+    from vrrt_jax.splat.camera_fields import camera_from_dict
     from vrrt_jax.splat.mujoco_images import MeshRenderer
     from vrrt_jax.splat.picture_file import write_image
 
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
     width, height = arguments.size
-    camera = problems.camera_from_dict(problems.read_json(arguments.camera), (height, width))
+    camera = camera_from_dict(read_fields(arguments.camera), (height, width))
     q = checks.check_limits(robot, np.array(arguments.q), "configuration")
     picture = MeshRenderer(_meshes(robot)).picture(q, camera)
     if not picture.alpha.any():
@@ -369,6 +402,13 @@ def _worlds(arguments: argparse.Namespace) -> int:
         write_obstacles(random_world(robot, seed), out / f"{robot.name}_{k}.xml", comment)
     print(f"wrote {arguments.num} worlds to {out}")
     return EXIT_SOLVED
+
+
+def _box(text: str) -> list[float]:
+    values = command.numbers(text)
+    if len(values) != 4:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a box such as 80,40,560,470")
+    return values.tolist()
 
 
 def _size(text: str) -> tuple[int, int]:

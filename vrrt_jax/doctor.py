@@ -16,6 +16,7 @@ from vrrt_jax.robots.mesh_sources import install_hint, mesh_file, mesh_spec
 _EXTRAS = {
     "plot": ("figures and animations", "matplotlib"),
     "view": ("plans in the browser", "viser"),
+    "photo": ("lenses with distortion, masks from boxes, camera poses", "cv2"),
     "notebook": ("notebooks", "nbclient"),
     "peers": ("OMPL's planners in benchmarks", "ompl"),
 }

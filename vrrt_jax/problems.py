@@ -10,20 +10,22 @@ import numpy as np
 from PIL import Image
 
 from vrrt_jax.checks import check_limits
+from vrrt_jax.core.data_file import read_json
 from vrrt_jax.core.fields import check_fields
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots import Robot, load_robot, robot_names, scenes_dir
 from vrrt_jax.scene.obstacles import load_obstacles, write_obstacles
 from vrrt_jax.scene.world import World, build_world, held_names, obstacle_list
-from vrrt_jax.splat.camera_fields import camera_from_dict, camera_to_dict
+from vrrt_jax.splat.camera_fields import camera_to_dict
 from vrrt_jax.splat.model import SelfModel, load_self_model, save_self_model
+from vrrt_jax.splat.photo import Photo, load_photo
 from vrrt_jax.splat.picture_file import read_image
 from vrrt_jax.splat.types import Camera
 from vrrt_jax.visual.goal import ImageGoal
 
 FIELDS = ("robot", "world", "self_model", "start", "views", "true_goal")  # of problem.json
-VIEW_FIELDS = ("image", "camera")  # of one of its views
+VIEW_FIELDS = ("image", "camera", "mask")  # of one of its views
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -38,11 +40,13 @@ class Problem:
     goal_images: tuple[np.ndarray, ...]  # (H, W, 3 or 4) float32
     q_start: np.ndarray  # (D,)
     true_goal: np.ndarray | None  # (D,) for scoring alone; the planner never sees it
+    # (H, W) bool, True where a goal image is compared; None for all of it, or of all of them
+    masks: tuple[np.ndarray | None, ...] | None = None
 
     @property
     def goal(self) -> ImageGoal:
         """The robot should look like the goal images."""
-        return ImageGoal(self.self_model, self.cameras, self.goal_images)
+        return ImageGoal(self.self_model, self.cameras, self.goal_images, self.masks)
 
 
 def problem_names() -> list[str]:
@@ -79,18 +83,13 @@ def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
         self_model = None if self_model is None else _beside(folder, self_model, "self_model")
         true_goal = fields.get("true_goal")
         views = _checked_views(fields["views"], file)
-        images = tuple(read_image(_beside(folder, view["image"], "image")) for view in views)
-        cameras = tuple(
-            camera_from_dict(view["camera"], image.shape[:2])
-            for view, image in zip(views, images, strict=True)
-        )
+        photos = [_load_view(folder, view) for view in views]
         return Problem(
             name=folder.resolve().name,
             robot=robot,
             world=load_world(_beside(folder, fields["world"], "world"), robot, engine=engine),
             self_model=load_self_model(self_model_path(robot, self_model)),
-            cameras=cameras,
-            goal_images=images,
+            **views_of(photos),
             q_start=_vector(fields["start"], "start"),
             true_goal=None if true_goal is None else check_limits(robot, true_goal, "true_goal"),
         )
@@ -118,7 +117,12 @@ def save_problem(problem: Problem, folder: Path) -> None:
     for index, image in enumerate(problem.goal_images):
         name, pixels = f"goal_{index + 1}.png", np.round(255 * np.clip(image, 0, 1))
         Image.fromarray(pixels.astype(np.uint8)).save(folder / name)
-        views.append({"image": name, "camera": camera_to_dict(problem.cameras[index])})
+        view = {"image": name, "camera": camera_to_dict(problem.cameras[index])}
+        if problem.masks is not None and problem.masks[index] is not None:
+            view["mask"] = f"mask_{index + 1}.png"
+            pixels = 255 * np.asarray(problem.masks[index], np.uint8)
+            Image.fromarray(pixels).save(folder / view["mask"])
+        views.append(view)
     fields: dict[str, Any] = {
         "robot": "robot.xml",
         "world": "world.xml",
@@ -178,21 +182,24 @@ def self_model_path(robot: Robot, given: str | Path | None = None) -> Path:
     return scenes_dir() / "robots" / robot.name / "self_model.npz"
 
 
-def read_json(path: str | Path) -> Any:
-    """Read a JSON file.
+def views_of(photos: Sequence[Photo]) -> dict[str, Any]:
+    """What a :class:`Problem` has of its photographs, by the names of its fields."""
+    masks = tuple(photo.mask for photo in photos)
+    return {
+        "cameras": tuple(photo.camera for photo in photos),
+        "goal_images": tuple(photo.image for photo in photos),
+        "masks": None if all(mask is None for mask in masks) else masks,
+    }
 
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not JSON, or truncated, or a field is there twice.
-    """
-    try:
-        return json.loads(
-            Path(path).read_text(encoding="utf-8-sig"), object_pairs_hook=_without_duplicates
-        )
-    except OSError as error:
-        raise FileNotFoundError(f"cannot read '{path}': {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"'{path}' is not valid JSON: {error}") from None
+
+def _load_view(folder: Path, view: dict[str, Any]) -> Photo:
+    """A view of a problem's folder."""
+    camera = view["camera"]
+    camera = _beside(folder, camera, "camera") if isinstance(camera, str) else camera
+    image = read_image(_beside(folder, view["image"], "image"))
+    mask = view.get("mask")
+    mask = None if mask is None else read_image(_beside(folder, mask, "mask"))
+    return load_photo(image, camera, mask=mask)
 
 
 def _checked_views(views: Any, file: Path) -> list[dict[str, Any]]:
@@ -217,14 +224,6 @@ def _beside(folder: Path, name: Any, what: str) -> str:
     if not isinstance(name, str) or not name:
         raise ValueError(f"{what} is {name!r}; expected a name or a path")
     return str(folder / name) if (folder / name).is_file() else name
-
-
-def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """The fields of an object, or a ValueError: JSON would take the last of two silently."""
-    names = [name for name, _ in pairs]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"the field {', '.join(map(repr, twice))} is there twice")
-    return dict(pairs)
 
 
 def _vector(values: Sequence[float], what: str) -> np.ndarray:

@@ -38,6 +38,7 @@ def add_bench(kinds: Any) -> None:
     ):
         _add_protocol(kinds.add_parser(what, help=words), what)
     _add_arm(kinds.add_parser("arm", help="joint goals, on files of problems from elsewhere"))
+    _add_dream(kinds.add_parser("dream", help="joint angles from photographs in DREAM's format"))
 
 
 def add_robot(parser: argparse.ArgumentParser, required: bool = True) -> None:
@@ -139,6 +140,39 @@ def _add_arm(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", help="write results here; go on from what it holds")
 
 
+def _add_dream(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(run=_dream)
+    parser.add_argument("folder", help="with NNNNNN.rgb.jpg, NNNNNN.json and _camera_settings.json")
+    parser.add_argument("--robot", default="panda", help="panda, ur5e or fetch")
+    parser.add_argument(
+        "--levels",
+        type=command.numbers,
+        default="1.0",
+        help="distances of starts from the true joints [rad]",
+    )
+    parser.add_argument(
+        "--limit", type=command.whole(1, 1_000_000), help="frames, evenly taken; all by default"
+    )
+    parser.add_argument(
+        "--mask",
+        default="file",
+        choices=("file", "background", "box", "plain"),
+        help="what tells the robot: NNNNNN.mask.png, a picture without it, GrabCut in a box around "
+        "the true pose, or a plain background",
+    )
+    parser.add_argument("--background", help="the picture without the robot")
+    parser.add_argument(
+        "--extrinsics", help="a file with the camera's pose; by PnP from keypoints without it"
+    )
+    _add_engine(parser)
+    parser.add_argument("--seed", type=command.seed, default=0, help="of starts and plans")
+    parser.add_argument(
+        "--time-limit", type=command.seconds, default=60.0, help="of one search [s]"
+    )
+    parser.add_argument("--jobs", type=command.whole(1, 1024), default=1, help="processes")
+    parser.add_argument("--json", help="write results here; go on from what it holds")
+
+
 def _light(text: str) -> float | str:
     return text if text == "side" else command.real(0.01, 100.0)(text)
 
@@ -215,6 +249,20 @@ def _arm(arguments: argparse.Namespace) -> int:
         **{name: getattr(arguments, name) for name in ("peers", "seed")},
     )
     print(arm_table.to_text(arm.run(benchmark, files, arguments.json)))
+    return EXIT_SOLVED
+
+
+def _dream(arguments: argparse.Namespace) -> int:
+    from vrrt_jax.bench import dream, dream_table
+    from vrrt_jax.config import PlannerConfig
+
+    names = ("folder", "robot", "limit", "mask", "background", "extrinsics", "engine", "seed")
+    benchmark = dream.DreamBenchmark(
+        levels=tuple(round(float(level), 6) for level in arguments.levels),
+        config=PlannerConfig().changed({"budget.time_limit_s": arguments.time_limit}),
+        **{name: getattr(arguments, name) for name in names},
+    )
+    print(dream_table.to_text(dream.run(benchmark, arguments.json, jobs=arguments.jobs)))
     return EXIT_SOLVED
 
 

@@ -20,8 +20,8 @@ def check_fields(
     unknown = [name for name in fields if name not in known]
     if not unknown:
         return
-    told = dict.fromkeys((advice or {}).get(name.lower(), "") for name in unknown)
+    told = dict.fromkeys((advice or {}).get(str(name).lower(), "") for name in unknown)
     raise ValueError(
-        f"{what} has unknown fields: {', '.join(unknown)}; known ones: {', '.join(known)}"
+        f"{what} has unknown fields: {', '.join(map(str, unknown))}; known ones: {', '.join(known)}"
         + "".join(f"; {text}" for text in told if text)
     )

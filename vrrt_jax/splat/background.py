@@ -55,7 +55,7 @@ def robot_on_plain_background(
     # Without loss nothing bleeds.
     if np.ptp(color) > COLORFUL and np.mean(_is_faint(apart)) > MIN_FAINT:
         image, is_robot = _without_bleeding(image, color, apart, is_robot)
-    is_robot = _without_specks(is_robot, apart, spread)
+    is_robot = without_specks(is_robot, apart, spread)
     _check_covered(is_robot, valid)
     _check_outline(is_robot & valid, apart)
     return image, is_robot.astype(np.float32)
@@ -115,7 +115,7 @@ def _without_bleeding(
     return np.where(is_mended[..., None], own + color, image), is_robot
 
 
-def _without_specks(is_robot: np.ndarray, apart: np.ndarray, spread: float) -> np.ndarray:
+def without_specks(is_robot: np.ndarray, apart: np.ndarray, spread: float) -> np.ndarray:
     """What is robot (H, W), without specks, and without holes that are not background.
 
     A hole is small, or most of it differs from the background's color: there the robot's shading

@@ -93,7 +93,7 @@ def check_brightness(image: np.ndarray) -> None:
         )
 
 
-def valid_mask(mask: Any, height: int, width: int) -> np.ndarray:
+def valid_mask(mask: Any, height: int, width: int, what: str = "the mask") -> np.ndarray:
     """A mask of pixels that are compared, as float32 (H, W) of 0 and 1.
 
     Args:
@@ -101,6 +101,7 @@ def valid_mask(mask: Any, height: int, width: int) -> np.ndarray:
             :func:`~vrrt_jax.read_image` gives it, with the same in all channels.
         height: H of its image [px].
         width: W of its image [px].
+        what: its name in errors.
 
     Raises:
         ValueError: it has another shape or other values, or is nowhere true.
@@ -111,17 +112,17 @@ def valid_mask(mask: Any, height: int, width: int) -> np.ndarray:
     if mask.shape != (height, width):
         is_turned = mask.shape == (width, height)
         raise ValueError(
-            f"the mask has shape {mask.shape}; expected {(height, width)}, as the image"
+            f"{what} has shape {mask.shape}; expected {(height, width)}, as the image"
             f"{': it is turned by a quarter' * is_turned}"
         )
     if mask.dtype != bool:
-        mask = _truths(mask)
+        mask = _truths(mask, what)
     if not mask.any():
-        raise ValueError("the mask hides every pixel; True marks the pixels to compare")
+        raise ValueError(f"{what} hides every pixel; True marks the pixels to compare")
     return mask.astype(np.float32)
 
 
-def _truths(mask: np.ndarray) -> np.ndarray:
+def _truths(mask: np.ndarray, what: str) -> np.ndarray:
     """Numbers from 0 to 1, to 255 or to 65535 as truths: those in the upper half."""
     values = mask.astype(np.float64)
     largest = values.max()
@@ -130,7 +131,7 @@ def _truths(mask: np.ndarray) -> np.ndarray:
         np.all(np.isfinite(values)) and values.min() >= 0 and (largest > full / 2 or not largest)
     ):
         raise ValueError(
-            f"the mask has values from {values.min():g} to {largest:g}; expected False and True, 0 "
+            f"{what} has values from {values.min():g} to {largest:g}; expected False and True, 0 "
             "and 1, or 0 and 255"
         )
     return values > full / 2

@@ -85,14 +85,14 @@ class ImageGoal:
     # [0, 1]; or V
     image: np.ndarray | Sequence[np.ndarray]
     # (H, W) bool, or 0 and 1, or 0 and 255: true for the pixels that are compared, where not all
-    # are; or V of them
-    mask: np.ndarray | Sequence[np.ndarray] | None = None
+    # are; or V of them, None where all are
+    mask: np.ndarray | Sequence[np.ndarray | None] | None = None
     # A subclass may change the loss. The threshold stays the one that is calibrated for the loss of
     # ImageObjective, times the setting match.scale.
     objective: type[ImageObjective] = ImageObjective
 
     @property
-    def views(self) -> tuple[list[Camera], list[np.ndarray], list[np.ndarray] | None]:
+    def views(self) -> tuple[list[Camera], list[np.ndarray], list[np.ndarray | None] | None]:
         """Cameras, images and masks of V views."""
         if isinstance(self.camera, Camera):
             masks = None if self.mask is None else [np.asarray(self.mask)]

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import vrrt_jax
-from vrrt_jax.problems import camera_from_dict, read_json
+from vrrt_jax.core.data_file import read_json
 from vrrt_jax.splat.camera import project, shrunk, squared
+from vrrt_jax.splat.camera_fields import camera_from_dict
 from vrrt_jax.splat.images import prepare_goal
 
 SIZE = (480, 640)
@@ -42,7 +43,8 @@ def test_both_kinds_of_files_are_the_same_camera():
     [
         (CALIBRATED | {"cx": 350.2, "cy": 231.7}, 'unknown fields: cx, cy; .* "centre"'),
         (CALIBRATED | {"principal_point": [1, 2]}, 'principal_point; .* "centre"'),
-        (CALIBRATED | {"K": np.eye(3).tolist()}, 'fields: K; .* "focal": .*"centre"'),
+        (CALIBRATED | {"K": np.eye(3).tolist()}, "fields: focal; .* in camera_matrix"),
+        (CALIBRATED | {"intrinsics": [5, 5]}, 'fields: intrinsics; .* "camera_matrix"'),
         (CALIBRATED | {"distortion": [0.1, 0]}, "fields: distortion; .* undistort"),
         (CALIBRATED | {"D": [0.1, 0]}, "fields: D; .* undistort"),
         ({"world_to_cam": MATRIX.tolist(), "fx": 5, "fy": 5}, 'fields: fx, fy; .* "focal"'),
@@ -52,8 +54,10 @@ def test_both_kinds_of_files_are_the_same_camera():
         (PLACED | {"height": 640, "width": 480}, "width is 480 px"),
         (CALIBRATED | {"fovy_deg": 45}, "has fovy_deg beside world_to_cam, focal"),
         (PLACED | CALIBRATED, "not both"),
+        (CALIBRATED | {"camera_to_world": MATRIX.tolist()}, "camera_to_world and world_to_cam;"),
         ({"position": [1, 1, 1]}, "lacks the field 'target', 'fovy_deg'"),
-        ({"centre": [320, 240]}, "lacks the field 'world_to_cam', 'focal'"),
+        ({"centre": [320, 240]}, "lacks the field 'focal'"),
+        ({"focal": 500}, "has no extrinsics; say where the camera is"),
         ([1, 2], "the camera is a list; expected an object"),
         (CALIBRATED | {"world_to_cam": MATRIX.T.tolist()}, "0 0 0 1: transpose the matrix"),
         (CALIBRATED | {"world_to_cam": changed(3, 3, 2.0)}, "last row is .* expected 0 0 0 1"),
