@@ -17,7 +17,7 @@ VRRT_ROOMS = (
     ("config", "checks", "outcome"),
     ("visual",),
     ("attempts", "joint"),
-    ("planner", "pose", "problems"),
+    ("planner", "pose", "problems", "random_problem"),
     ("report", "viz", "viewer", "doctor"),
     ("bench",),
     ("cli",),

@@ -12,6 +12,7 @@ from vrrt_jax.core import command
 from vrrt_jax.core.command import EXIT_SOLVED, EXIT_UNSOLVED
 
 LARGEST_SIDE = 8192  # of an image that is drawn [px]
+RANDOM = "random"  # in place of a goal image: one is drawn
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,12 +32,17 @@ def _parser() -> argparse.ArgumentParser:
     add_robot(plan, required=False)
     plan.add_argument("--world", help="an MJCF file of obstacles, or a packaged world")
     plan.add_argument("--engine", default="mjx", help="collision checks: mjx, closed_form")
-    plan.add_argument("--goal", nargs="+", help="goal images, RGB with mask or plain background")
+    plan.add_argument(
+        "--goal",
+        nargs="+",
+        help="goal images, RGB with mask or plain background; or the word random: MuJoCo draws a "
+        "pose near the start, which may be left out then, and the world too",
+    )
     plan.add_argument("--camera", nargs="+", help="a JSON file for each goal image")
     plan.add_argument(
         "--start", type=command.numbers, help="start configuration, as --start=0,0.3,..."
     )
-    plan.add_argument("--self-model", help="trained .npz; the robot's own by default")
+    plan.add_argument("--self-model", help="trained .npz; the one of the robot's folder by default")
     plan.add_argument("--seed", type=command.seed, default=0, help="of all that is random")
     plan.add_argument("--time-limit", type=command.seconds, default=60.0, help="of the search [s]")
     plan.add_argument("--paper", action="store_true", help="the published settings")
@@ -65,15 +71,21 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--size", type=_size, default=(480, 480), help="WIDTHxHEIGHT [px]")
     render.add_argument("--out", required=True, help="a .png file")
 
-    fit = commands.add_parser("fit", help="train a robot's self-model")
-    fit.set_defaults(run=_fit, out_is_file=True)
-    add_robot(fit)
-    fit.add_argument("--out", required=True, help="a .npz file")
+    fit = commands.add_parser("fit", help="make a robot's folder, with its self-model")
+    fit.set_defaults(run=_fit)
+    fit.add_argument("file", nargs="?", help="an MJCF or URDF file")
+    add_robot(fit, required=False)
+    fit.add_argument("--out", required=True, help="a new folder, or one to train further")
+    fit.add_argument(
+        "--minutes",
+        type=command.real(0.0, 1e5),
+        default=3.0,
+        help="how long to train; the first round is finished in any case",
+    )
     fit.add_argument("--seed", type=command.seed, default=0, help="of poses, cameras and splats")
-    fit.add_argument("--images", type=command.whole(1, 100_000), help="number of training images")
     fit.add_argument(
         "--detail",
-        type=command.real(0.01, 100.0),
+        type=command.real(0.1, 100.0),
         default=1.0,
         help="times the usual number of splats",
     )
@@ -130,6 +142,7 @@ def _plan(arguments: argparse.Namespace) -> int:
     import vrrt_jax
     from vrrt_jax import report
     from vrrt_jax.config import check_config
+    from vrrt_jax.core.edges import joint_error
 
     changes: dict[str, Any] = {"budget.time_limit_s": arguments.time_limit}
     if arguments.capacity is not None:
@@ -157,6 +170,13 @@ def _plan(arguments: argparse.Namespace) -> int:
             on_progress=on_progress,
         )
     print(result)
+    if problem.true_goal is not None:
+        error = joint_error(problem.world, result.target, problem.true_goal)
+        most = problem.robot.joint_names[int(error.argmax())]
+        print(
+            f"off from the true goal by {error.mean():.3f} rad on average of the joints, most of "
+            f"all {most}, by {error.max():.3f}"
+        )
     with command.or_printed(lambda: f"path: {json.dumps(result.path.tolist())}"):
         report.save_result(problem, result, config, arguments.seed, out)
     if limits is not None and result.ok:
@@ -167,6 +187,8 @@ def _plan(arguments: argparse.Namespace) -> int:
         _pictures(problem, result, out)
     if not result.ok:
         print(f"{result.status.name}: {result.status.value}; {result.advice}", file=sys.stderr)
+    elif result.advice:
+        print(result.advice)
     return EXIT_SOLVED if result.ok else EXIT_UNSOLVED
 
 
@@ -227,6 +249,8 @@ def _problem(arguments: argparse.Namespace):
             options = ", --".join(given).replace("_", "-")
             raise ValueError(f"give either --problem or --{options}, not both")
         return problems.load_problem(arguments.problem, engine=arguments.engine)
+    if arguments.goal == [RANDOM]:
+        return _random_problem(arguments)
     missing = [name for name in parts if name not in given]
     if missing:
         raise ValueError(
@@ -255,6 +279,27 @@ def _problem(arguments: argparse.Namespace):
     )
 
 
+def _random_problem(arguments: argparse.Namespace):
+    """A problem whose goal is drawn."""
+    from vrrt_jax import problems
+    from vrrt_jax.random_problem import random_problem
+    from vrrt_jax.robots import load_robot
+    from vrrt_jax.scene.world import build_world
+    from vrrt_jax.splat.model import load_self_model
+
+    if arguments.robot is None:
+        raise ValueError("missing --robot, whose pose --goal random draws")
+    if arguments.camera is not None:
+        raise ValueError("--goal random has a camera of its own; drop --camera")
+    robot = load_robot(arguments.robot, freeze=arguments.freeze)
+    if arguments.world is None:
+        world = build_world(robot, [], engine=arguments.engine)
+    else:
+        world = problems.load_world(arguments.world, robot, engine=arguments.engine)
+    self_model = load_self_model(problems.self_model_path(robot, arguments.self_model))
+    return random_problem(robot, world, self_model, seed=arguments.seed, q_start=arguments.start)
+
+
 def _render(arguments: argparse.Namespace) -> int:
     import numpy as np
 
@@ -276,23 +321,26 @@ def _render(arguments: argparse.Namespace) -> int:
 
 
 def _fit(arguments: argparse.Namespace) -> int:
-    import dataclasses
+    from vrrt_jax.splat.fit_robot import PICTURE, fit_robot
 
-    from vrrt_jax.robots import load_robot
-    from vrrt_jax.splat.fit import FitConfig, fit_self_model
-
-    robot = load_robot(arguments.robot, freeze=arguments.freeze)
-    config = FitConfig(detail=arguments.detail)
-    if arguments.images is not None:
-        config = dataclasses.replace(config, num_images=arguments.images)
-    model = fit_self_model(robot, _meshes(robot), arguments.out, seed=arguments.seed, config=config)
-    for level in (*model.levels, model.close_up):
-        print(
-            f"{level.splats.num_splats} splats at {level.size_px} px: {level.psnr_db:.1f} dB on "
-            f"{model.info['num_validation']} unseen poses and cameras, match threshold "
-            f"{level.match_threshold:.3g} of the covered share"
+    sources = [source for source in (arguments.file, arguments.robot) if source is not None]
+    if len(sources) != 1:
+        raise ValueError(
+            "expected one robot: an MJCF or URDF file, as in vrrt fit arm.xml --out arm, or --robot"
         )
-    print(f"wrote {arguments.out} after {model.info['seconds']:.0f} s, seed {model.seed}")
+    out = arguments.out
+    fit_robot(
+        sources[0],
+        out,
+        minutes=arguments.minutes,
+        freeze=arguments.freeze,
+        seed=arguments.seed,
+        detail=arguments.detail,
+    )
+    print(
+        f"wrote {out}; {Path(out) / PICTURE} shows MuJoCo's images above the self-model's. Plan "
+        f"with: vrrt plan --robot {out} --goal random; train on with the same command again"
+    )
     return EXIT_SOLVED
 
 
@@ -336,7 +384,7 @@ def _meshes(robot):
     spec = mesh_spec(robot)
     if spec is None:
         raise ValueError(
-            f"the meshes of '{robot.name}' are not on this machine; pip install "
+            f"the meshes of '{robot.name}' are not on this machine: "
             f"{install_hint(robot.mesh_source)}"
         )
     return spec
