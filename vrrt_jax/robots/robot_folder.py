@@ -67,11 +67,13 @@ def read_record(folder: Path) -> Record:
     if found != FORMAT:
         raise ValueError(f"'{file}' has format {found}, expected {FORMAT}; {again}")
     names = [field.name for field in dataclasses.fields(Record)]
-    check_fields(fields, names, f"'{file}'")
+    check_fields(fields, names, f"'{file}', made by another version or by hand ({again}),")
     if missing := [name for name in names if name not in fields]:
         raise ValueError(f"'{file}' lacks the field {', '.join(missing)}; {again}")
     record = Record(**fields)
-    made_of = record.made_of
+    made_of, rounds = record.made_of, record.rounds
+    if type(rounds) is not int or rounds < 0:
+        raise ValueError(f"'{file}': rounds is {rounds!r}; expected a whole number; {again}")
     if not isinstance(made_of, dict) or not isinstance(made_of.get("source"), str):
         raise ValueError(f"'{file}' does not say what the robot was made of; {again}")
     if not (folder / MODEL).is_file():

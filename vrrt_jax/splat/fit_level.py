@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from vrrt_jax.splat.types import SplatModel
 
 CHECKPOINT_STEPS = 50
 TRAINED = ("mean", "radius", "density", "rgb", "view_color_gradient", "tau")
+ADAM = optax.scale_by_adam(b1=0.9, b2=0.99)
 MIN_TAU = 0.03  # [m] the softness of occlusion stays above this
 
 
@@ -65,10 +65,8 @@ def fit_level(
     train, held_out = shrink(train, level.size_px), shrink(held_out, level.size_px)
     start = initial_splats(points, level.num_splats, seed) if trained is None else trained
     change = {name: jnp.zeros_like(getattr(start, name)) for name in TRAINED}
-    schedule = optax.cosine_decay_schedule(learning_rate, level.steps, 0.02)
-    optimizer = optax.adam(schedule, b1=0.9, b2=0.99)
-    state = optimizer.init(change)
-    step = _training_step(optimizer, level.batch)
+    rate = optax.cosine_decay_schedule(learning_rate, level.steps, 0.02)
+    state = ADAM.init(change)
 
     # Each step takes the first images of an order of its own, which does not depend on where the
     # training was interrupted.
@@ -89,7 +87,7 @@ def fit_level(
             _store_checkpoint(file, change, state, i)
             raise OutOfTime
         images = _batch(train, order[i, : level.batch])
-        change, state, value = step(robot.chain, start, change, state, *images)
+        change, state, value = _step(robot.chain, start, change, state, rate(i), *images)
         if (i + 1) % CHECKPOINT_STEPS == 0 or i + 1 == level.steps:
             progress.set_postfix_str(f"{psnr_db(float(value)):.1f} dB")
             _store_checkpoint(file, change, state, i + 1)
@@ -126,29 +124,26 @@ def _assemble(start: SplatModel, change: dict[str, jax.Array]) -> SplatModel:
     )
 
 
-def _training_step(optimizer: optax.GradientTransformation, num: int) -> Callable:
-    """A compiled step: changes, optimizer's state and a batch to new changes, state and loss.
+@jax.jit
+def _step(chain: Chain, start: SplatModel, change, state, rate, *batch):
+    """Changes, optimizer's state and the mean loss after a step on a batch of images.
 
-    Robot and splats are arguments, so that one program serves all rounds of training.
+    All numbers are arguments, so that one program serves all rounds of training.
     """
 
-    def loss(change, chain: Chain, start: SplatModel, *image):
+    def loss(change, *image):
         return _loss(chain, _assemble(start, change), *image)
 
-    @jax.jit
-    def step(chain, start, change, state, *batch):
-        # One image after the other, with the memory of one.
-        def add(total, example):
-            value, gradient = jax.value_and_grad(loss)(change, chain, start, *example)
-            return jax.tree.map(jnp.add, total, (value, gradient)), None
+    # One image after the other, with the memory of one.
+    def add(total, image):
+        return jax.tree.map(jnp.add, total, jax.value_and_grad(loss)(change, *image)), None
 
-        zero = (jnp.float32(0), jax.tree.map(jnp.zeros_like, change))
-        (value, gradient), _ = jax.lax.scan(add, zero, batch)
-        gradient = jax.tree.map(lambda g: g / num, gradient)
-        updates, state = optimizer.update(gradient, state)
-        return optax.apply_updates(change, updates), state, value / num
-
-    return step
+    zero = (jnp.float32(0), jax.tree.map(jnp.zeros_like, change))
+    sums, _ = jax.lax.scan(add, zero, batch)
+    value, gradient = jax.tree.map(lambda total: total / len(batch[0]), sums)
+    updates, state = ADAM.update(gradient, state)
+    change = jax.tree.map(lambda c, update: c - rate * update, change, updates)
+    return change, state, value
 
 
 def _batch(images: TrainingImages, rows: np.ndarray | int) -> tuple[Any, ...]:
