@@ -124,6 +124,9 @@ def fit_robot(
         except OutOfTime:
             progress("the time is up amid a round, which the same command goes on with")
             break
+        except OSError as error:
+            kept = "what was done is kept, and the same command goes on with it"
+            raise OSError(error.errno, f"{error.strerror}; {kept}", str(folder)) from None
         took = time.monotonic() - started
     return record
 
@@ -145,6 +148,8 @@ def _check_empty(folder: Path) -> None:
             f"'{name}' is the name of a packaged robot, which would be taken for the folder; "
             "choose another name"
         )
+    if folder.suffix == ".npz":
+        raise ValueError(f"'{folder}' names a file; expected a folder, such as '{folder.stem}'")
     folder.mkdir(parents=True, exist_ok=True)
     others = sorted(file.name for file in folder.iterdir() if file.suffix != UNFINISHED)
     if others:

@@ -124,6 +124,7 @@ def test_other_arguments_and_other_things_are_refused(made, tmp_path, capsys):
         ([file, "--out", folder, "--seed", 1], "was made with seed 0, not 1"),
         ([file, "--out", folder, "--freeze", "turn=0"], "was made with freeze {}"),
         ([file, "--out", filled], "holds other things (letter.txt)"),
+        ([file, "--out", tmp_path / "arm.npz"], "names a file; expected a folder, such as"),
         ([file, "--out", tmp_path / "panda"], "the name of a packaged robot"),
         ([folder, "--out", tmp_path / "new"], "is a folder; expected an MJCF or URDF file"),
         ([tmp_path / "none.xml", "--out", tmp_path / "new"], "does not exist"),
