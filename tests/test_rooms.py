@@ -19,7 +19,7 @@ VRRT_ROOMS = (
     ("attempts", "joint"),
     ("planner", "pose", "problems", "random_problem"),
     ("report", "viz", "viewer", "doctor"),
-    ("bench",),
+    ("bench", "robot_commands"),
     ("cli",),
 )
 NRP_ROOMS = (

@@ -10,6 +10,7 @@ from typing import Any
 from vrrt_jax.bench.commands import add_bench, add_robot
 from vrrt_jax.core import command
 from vrrt_jax.core.command import EXIT_SOLVED, EXIT_UNSOLVED
+from vrrt_jax.robot_commands import add_robot_commands
 
 LARGEST_SIDE = 8192  # of an image that is drawn [px]
 RANDOM = "random"  # in place of a goal image: one is drawn
@@ -71,50 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--size", type=_size, default=(480, 480), help="WIDTHxHEIGHT [px]")
     render.add_argument("--out", required=True, help="a .png file")
 
-    fit = commands.add_parser("fit", help="make a robot's folder, with its self-model")
-    fit.set_defaults(run=_fit)
-    fit.add_argument("file", nargs="?", help="an MJCF or URDF file")
-    add_robot(fit, required=False)
-    fit.add_argument("--out", required=True, help="a new folder, or one to train further")
-    fit.add_argument(
-        "--minutes",
-        type=command.real(0.0, 1e5),
-        default=3.0,
-        help="how long to train; the first round is finished in any case",
-    )
-    fit.add_argument("--seed", type=command.seed, default=0, help="of poses, cameras and splats")
-    fit.add_argument(
-        "--detail",
-        type=command.real(0.1, 100.0),
-        default=1.0,
-        help="times the usual number of splats",
-    )
-
-    spheres = commands.add_parser("spheres", help="fit collision spheres to a robot's meshes")
-    spheres.set_defaults(run=_spheres, out_is_file=True)
-    add_robot(spheres)
-    spheres.add_argument("--out", help="the MJCF file to write; only measured without it")
-    spheres.add_argument(
-        "--into",
-        help="an MJCF file that the command wrote: its joints and home stay, spheres are replaced",
-    )
-    spheres.add_argument("--seed", type=command.seed, default=0, help="of fit and measurement")
-    spheres.add_argument(
-        "--spheres",
-        type=command.whole(1, 200),
-        default=44,
-        help="collision spheres to fit, on all moving links together",
-    )
-    spheres.add_argument(
-        "--num",
-        type=command.whole(1, 10_000_000),
-        default=10_000,
-        help="configurations to measure on",
-    )
-    spheres.add_argument(
-        "--worlds", nargs="+", help="MJCF files to measure among; else random scenes"
-    )
-
+    add_robot_commands(commands)
     bench = commands.add_parser("bench", help="measure speed, success or settings")
     add_bench(bench.add_subparsers(dest="what", required=True))
 
@@ -122,13 +80,6 @@ def _parser() -> argparse.ArgumentParser:
     report.set_defaults(run=_report)
     report.add_argument("files", nargs="+", help="JSON files that vrrt bench wrote")
     report.add_argument("--out", required=True, help="folder for the page and its figures")
-
-    worlds = commands.add_parser("worlds", help="make random worlds around a robot")
-    worlds.set_defaults(run=_worlds)
-    add_robot(worlds)
-    worlds.add_argument("--num", type=command.whole(1, 100_000), default=6, help="worlds")
-    worlds.add_argument("--seed", type=command.seed, default=0, help="before the first world's")
-    worlds.add_argument("--out", required=True, help="folder for ROBOT_1.xml and so on")
 
     doctor = commands.add_parser("doctor", help="say what this machine has, and what it lacks")
     doctor.set_defaults(run=_doctor)
@@ -142,7 +93,6 @@ def _plan(arguments: argparse.Namespace) -> int:
     import vrrt_jax
     from vrrt_jax import report
     from vrrt_jax.config import check_config
-    from vrrt_jax.core.edges import joint_error
 
     changes: dict[str, Any] = {"budget.time_limit_s": arguments.time_limit}
     if arguments.capacity is not None:
@@ -171,12 +121,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         )
     print(result)
     if problem.true_goal is not None:
-        error = joint_error(problem.world, result.target, problem.true_goal)
-        most = problem.robot.joint_names[int(error.argmax())]
-        print(
-            f"off from the true goal by {error.mean():.3f} rad on average of the joints, most of "
-            f"all {most}, by {error.max():.3f}"
-        )
+        print(_off_by(problem, result))
     with command.or_printed(lambda: f"path: {json.dumps(result.path.tolist())}"):
         report.save_result(problem, result, config, arguments.seed, out)
     if limits is not None and result.ok:
@@ -190,6 +135,25 @@ def _plan(arguments: argparse.Namespace) -> int:
     elif result.advice:
         print(result.advice)
     return EXIT_SOLVED if result.ok else EXIT_UNSOLVED
+
+
+def _off_by(problem, result) -> str:
+    """How far the target is from the true goal: joints that the image tells, then all others."""
+    import numpy as np
+
+    from vrrt_jax.core.edges import joint_error
+    from vrrt_jax.visual.finish import UNTOLD
+
+    error = joint_error(problem.world, result.target, problem.true_goal)
+    uncertainty = result.joint_uncertainty
+    is_told = np.full(len(error), True) if uncertainty is None else uncertainty <= UNTOLD
+    names = np.array(problem.robot.joint_names)
+    of_told = error[is_told] if is_told.any() else error
+    text = f"off from the true goal by {of_told.mean():.3f} on average, at most {of_told.max():.3f}"
+    others = [f"{name} by {off:.2f}" for name, off in zip(names, error, strict=True)]
+    untold = [words for words, told in zip(others, is_told, strict=True) if not told]
+    hidden = f"; without what the image hardly tells: {', '.join(untold)}" if untold else ""
+    return f"{text} [rad or m]{hidden}"
 
 
 def _view(arguments: argparse.Namespace) -> int:
@@ -320,64 +284,6 @@ def _render(arguments: argparse.Namespace) -> int:
     return EXIT_SOLVED
 
 
-def _fit(arguments: argparse.Namespace) -> int:
-    from vrrt_jax.splat.fit_robot import PICTURE, fit_robot
-
-    sources = [source for source in (arguments.file, arguments.robot) if source is not None]
-    if len(sources) != 1:
-        raise ValueError(
-            "expected one robot: an MJCF or URDF file, as in vrrt fit arm.xml --out arm, or --robot"
-        )
-    out = arguments.out
-    fit_robot(
-        sources[0],
-        out,
-        minutes=arguments.minutes,
-        freeze=arguments.freeze,
-        seed=arguments.seed,
-        detail=arguments.detail,
-    )
-    print(
-        f"wrote {out}; {Path(out) / PICTURE} shows MuJoCo's images above the self-model's. Plan "
-        f"with: vrrt plan --robot {out} --goal random; train on with the same command again"
-    )
-    return EXIT_SOLVED
-
-
-def _spheres(arguments: argparse.Namespace) -> int:
-    from vrrt_jax.robots import load_robot
-    from vrrt_jax.robots.mjcf_writer import replace_spheres
-    from vrrt_jax.robots.robot_fit import fit_spheres
-    from vrrt_jax.scene.obstacles import load_obstacles
-    from vrrt_jax.scene.sphere_errors import measure_spheres
-
-    robot = load_robot(arguments.robot, freeze=arguments.freeze)
-    if arguments.out is not None:
-        text = fit_spheres(
-            robot, num_spheres=arguments.spheres, seed=arguments.seed, progress=print
-        )
-        if arguments.into is not None:
-            text = replace_spheres(Path(arguments.into).read_text(), text)
-        Path(arguments.out).write_text(text)
-        print(f"wrote {arguments.out}")
-        robot = load_robot(arguments.out)
-    scenes = [load_obstacles(path) for path in arguments.worlds or ()]
-    measured = measure_spheres(robot, arguments.num, arguments.seed, scenes)
-    covering, thin = robot.collision_spheres.radius, robot.self_collision_spheres.radius
-    print(f"{len(covering)} covering and {len(thin)} thin spheres")
-    for name, counts in (
-        ("against obstacles", measured.obstacles),
-        ("against itself", measured.self_collision),
-        ("in one count", measured.either),
-    ):
-        print(
-            f"{name}: {counts.misses} of {counts.colliding} collisions missed, "
-            f"{counts.false_alarms} false alarms in {counts.free} free configurations "
-            f"({100 * counts.false_alarm_rate:.2f} %)"
-        )
-    return EXIT_SOLVED
-
-
 def _meshes(robot):
     from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 
@@ -395,23 +301,6 @@ def _report(arguments: argparse.Namespace) -> int:
 
     page = tables.write_page([Path(file) for file in arguments.files], Path(arguments.out))
     print(f"wrote {page}")
-    return EXIT_SOLVED
-
-
-def _worlds(arguments: argparse.Namespace) -> int:
-    from vrrt_jax.bench.worlds import random_world
-    from vrrt_jax.robots import load_robot
-    from vrrt_jax.scene.obstacles import write_obstacles
-
-    robot, out = (
-        load_robot(arguments.robot, freeze=arguments.freeze),
-        Path(arguments.out),
-    )
-    for k in range(1, arguments.num + 1):
-        seed = arguments.seed + k
-        comment = f"Written by the command `vrrt worlds --robot {robot.name}`, seed {seed}."
-        write_obstacles(random_world(robot, seed), out / f"{robot.name}_{k}.xml", comment)
-    print(f"wrote {arguments.num} worlds to {out}")
     return EXIT_SOLVED
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+import types
 
 import numpy as np
 import pytest
@@ -195,6 +196,12 @@ def test_a_random_goal_is_a_problem_of_the_folder(made, tmp_path, capsys):
     assert np.isclose(np.linalg.norm(problem.true_goal - problem.q_start), 1.0, atol=1e-5)
     np.testing.assert_array_equal(problem.goal_images[0], again.goal_images[0])
     assert problem.goal_images[0][..., 3].mean() > 0.005
+    result = types.SimpleNamespace(target=problem.true_goal + np.array([0.25, 0.5], np.float32))
+    result.joint_uncertainty = np.array([0.1, 3.0])
+    assert cli._off_by(problem, result) == (
+        "off from the true goal by 0.250 on average, at most 0.250 [rad or m]; without what the "
+        "image hardly tells: turn by 0.50"
+    )
     for wrong, words in (
         (["--camera", "c.json"], "has a camera of its own"),
         (["--start", "9,9"], "start is outside the limits"),
