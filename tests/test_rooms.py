@@ -17,9 +17,9 @@ VRRT_ROOMS = (
     ("config", "checks", "outcome"),
     ("visual",),
     ("attempts", "joint"),
-    ("planner", "pose", "problems"),
+    ("planner", "pose", "problems", "random_problem"),
     ("report", "viz", "viewer", "doctor"),
-    ("bench",),
+    ("bench", "robot_commands"),
     ("cli",),
 )
 NRP_ROOMS = (

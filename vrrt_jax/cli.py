@@ -10,9 +10,11 @@ from typing import Any
 from vrrt_jax.bench.commands import add_bench, add_robot
 from vrrt_jax.core import command
 from vrrt_jax.core.command import EXIT_SOLVED, EXIT_UNSOLVED
+from vrrt_jax.robot_commands import add_robot_commands
 
 LARGEST_SIDE = 8192  # of an image that is drawn [px]
 PHOTO = ("extrinsics", "robot_mask", "background", "box")  # what is told of each goal image
+RANDOM = "random"  # in place of a goal image: one is drawn
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,7 +34,12 @@ def _parser() -> argparse.ArgumentParser:
     add_robot(plan, required=False)
     plan.add_argument("--world", help="an MJCF file of obstacles, or a packaged world")
     plan.add_argument("--engine", default="mjx", help="collision checks: mjx, closed_form")
-    plan.add_argument("--goal", nargs="+", help="goal images, RGB with mask or plain background")
+    plan.add_argument(
+        "--goal",
+        nargs="+",
+        help="goal images, RGB with mask or plain background; or the word random: MuJoCo draws a "
+        "pose near the start, which may be left out then, and the world too",
+    )
     plan.add_argument(
         "--camera", nargs="+", help="a JSON or YAML file for each goal image: OpenCV's, ROS's, ours"
     )
@@ -40,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument(
         "--start", type=command.numbers, help="start configuration, as --start=0,0.3,..."
     )
-    plan.add_argument("--self-model", help="trained .npz; the robot's own by default")
+    plan.add_argument("--self-model", help="trained .npz; the one of the robot's folder by default")
     plan.add_argument("--seed", type=command.seed, default=0, help="of all that is random")
     plan.add_argument("--time-limit", type=command.seconds, default=60.0, help="of the search [s]")
     plan.add_argument("--paper", action="store_true", help="the published settings")
@@ -69,44 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--size", type=_size, default=(480, 480), help="WIDTHxHEIGHT [px]")
     render.add_argument("--out", required=True, help="a .png file")
 
-    fit = commands.add_parser("fit", help="train a robot's self-model")
-    fit.set_defaults(run=_fit, out_is_file=True)
-    add_robot(fit)
-    fit.add_argument("--out", required=True, help="a .npz file")
-    fit.add_argument("--seed", type=command.seed, default=0, help="of poses, cameras and splats")
-    fit.add_argument("--images", type=command.whole(1, 100_000), help="number of training images")
-    fit.add_argument(
-        "--detail",
-        type=command.real(0.01, 100.0),
-        default=1.0,
-        help="times the usual number of splats",
-    )
-
-    spheres = commands.add_parser("spheres", help="fit collision spheres to a robot's meshes")
-    spheres.set_defaults(run=_spheres, out_is_file=True)
-    add_robot(spheres)
-    spheres.add_argument("--out", help="the MJCF file to write; only measured without it")
-    spheres.add_argument(
-        "--into",
-        help="an MJCF file that the command wrote: its joints and home stay, spheres are replaced",
-    )
-    spheres.add_argument("--seed", type=command.seed, default=0, help="of fit and measurement")
-    spheres.add_argument(
-        "--spheres",
-        type=command.whole(1, 200),
-        default=44,
-        help="collision spheres to fit, on all moving links together",
-    )
-    spheres.add_argument(
-        "--num",
-        type=command.whole(1, 10_000_000),
-        default=10_000,
-        help="configurations to measure on",
-    )
-    spheres.add_argument(
-        "--worlds", nargs="+", help="MJCF files to measure among; else random scenes"
-    )
-
+    add_robot_commands(commands)
     bench = commands.add_parser("bench", help="measure speed, success or settings")
     add_bench(bench.add_subparsers(dest="what", required=True))
 
@@ -114,13 +84,6 @@ def _parser() -> argparse.ArgumentParser:
     report.set_defaults(run=_report)
     report.add_argument("files", nargs="+", help="JSON files that vrrt bench wrote")
     report.add_argument("--out", required=True, help="folder for the page and its figures")
-
-    worlds = commands.add_parser("worlds", help="make random worlds around a robot")
-    worlds.set_defaults(run=_worlds)
-    add_robot(worlds)
-    worlds.add_argument("--num", type=command.whole(1, 100_000), default=6, help="worlds")
-    worlds.add_argument("--seed", type=command.seed, default=0, help="before the first world's")
-    worlds.add_argument("--out", required=True, help="folder for ROBOT_1.xml and so on")
 
     doctor = commands.add_parser("doctor", help="say what this machine has, and what it lacks")
     doctor.set_defaults(run=_doctor)
@@ -183,6 +146,8 @@ def _plan(arguments: argparse.Namespace) -> int:
             on_progress=on_progress,
         )
     print(result)
+    if problem.true_goal is not None:
+        print(_off_by(problem, result))
     with command.or_printed(lambda: f"path: {json.dumps(result.path.tolist())}"):
         report.save_result(problem, result, config, arguments.seed, out)
     if limits is not None and result.ok:
@@ -193,7 +158,28 @@ def _plan(arguments: argparse.Namespace) -> int:
         _pictures(problem, result, out)
     if not result.ok:
         print(f"{result.status.name}: {result.status.value}; {result.advice}", file=sys.stderr)
+    elif result.advice:
+        print(result.advice)
     return EXIT_SOLVED if result.ok else EXIT_UNSOLVED
+
+
+def _off_by(problem, result) -> str:
+    """How far the target is from the true goal: joints that the image tells, then all others."""
+    import numpy as np
+
+    from vrrt_jax.core.edges import joint_error
+    from vrrt_jax.visual.finish import UNTOLD
+
+    error = joint_error(problem.world, result.target, problem.true_goal)
+    uncertainty = result.joint_uncertainty
+    is_told = np.full(len(error), True) if uncertainty is None else uncertainty <= UNTOLD
+    names = np.array(problem.robot.joint_names)
+    of_told = error[is_told] if is_told.any() else error
+    text = f"off from the true goal by {of_told.mean():.3f} on average, at most {of_told.max():.3f}"
+    others = [f"{name} by {off:.2f}" for name, off in zip(names, error, strict=True)]
+    untold = [words for words, told in zip(others, is_told, strict=True) if not told]
+    hidden = f"; without what the image hardly tells: {', '.join(untold)}" if untold else ""
+    return f"{text} [rad or m]{hidden}"
 
 
 def _view(arguments: argparse.Namespace) -> int:
@@ -258,6 +244,8 @@ def _problem(arguments: argparse.Namespace):
             options = ", --".join(given).replace("_", "-")
             raise ValueError(f"give either --problem or --{options}, not both")
         return problems.load_problem(arguments.problem, engine=arguments.engine)
+    if arguments.goal == [RANDOM]:
+        return _random_problem(arguments)
     missing = [name for name in parts if name not in given]
     if missing:
         raise ValueError(
@@ -290,6 +278,29 @@ def _problem(arguments: argparse.Namespace):
     )
 
 
+def _random_problem(arguments: argparse.Namespace):
+    """A problem whose goal is drawn."""
+    from vrrt_jax import problems
+    from vrrt_jax.random_problem import random_problem
+    from vrrt_jax.robots import load_robot
+    from vrrt_jax.scene.world import build_world
+    from vrrt_jax.splat.model import load_self_model
+
+    if arguments.robot is None:
+        raise ValueError("missing --robot, whose pose --goal random draws")
+    for name in ("camera", *PHOTO):
+        if getattr(arguments, name) is not None:
+            option = name.replace("_", "-")
+            raise ValueError(f"--goal random has a camera and a mask of its own; drop --{option}")
+    robot = load_robot(arguments.robot, freeze=arguments.freeze)
+    if arguments.world is None:
+        world = build_world(robot, [], engine=arguments.engine)
+    else:
+        world = problems.load_world(arguments.world, robot, engine=arguments.engine)
+    self_model = load_self_model(problems.self_model_path(robot, arguments.self_model))
+    return random_problem(robot, world, self_model, seed=arguments.seed, q_start=arguments.start)
+
+
 def _render(arguments: argparse.Namespace) -> int:
     import numpy as np
 
@@ -312,68 +323,13 @@ def _render(arguments: argparse.Namespace) -> int:
     return EXIT_SOLVED
 
 
-def _fit(arguments: argparse.Namespace) -> int:
-    import dataclasses
-
-    from vrrt_jax.robots import load_robot
-    from vrrt_jax.splat.fit import FitConfig, fit_self_model
-
-    robot = load_robot(arguments.robot, freeze=arguments.freeze)
-    config = FitConfig(detail=arguments.detail)
-    if arguments.images is not None:
-        config = dataclasses.replace(config, num_images=arguments.images)
-    model = fit_self_model(robot, _meshes(robot), arguments.out, seed=arguments.seed, config=config)
-    for level in (*model.levels, model.close_up):
-        print(
-            f"{level.splats.num_splats} splats at {level.size_px} px: {level.psnr_db:.1f} dB on "
-            f"{model.info['num_validation']} unseen poses and cameras, match threshold "
-            f"{level.match_threshold:.3g} of the covered share"
-        )
-    print(f"wrote {arguments.out} after {model.info['seconds']:.0f} s, seed {model.seed}")
-    return EXIT_SOLVED
-
-
-def _spheres(arguments: argparse.Namespace) -> int:
-    from vrrt_jax.robots import load_robot
-    from vrrt_jax.robots.mjcf_writer import replace_spheres
-    from vrrt_jax.robots.robot_fit import fit_spheres
-    from vrrt_jax.scene.obstacles import load_obstacles
-    from vrrt_jax.scene.sphere_errors import measure_spheres
-
-    robot = load_robot(arguments.robot, freeze=arguments.freeze)
-    if arguments.out is not None:
-        text = fit_spheres(
-            robot, num_spheres=arguments.spheres, seed=arguments.seed, progress=print
-        )
-        if arguments.into is not None:
-            text = replace_spheres(Path(arguments.into).read_text(), text)
-        Path(arguments.out).write_text(text)
-        print(f"wrote {arguments.out}")
-        robot = load_robot(arguments.out)
-    scenes = [load_obstacles(path) for path in arguments.worlds or ()]
-    measured = measure_spheres(robot, arguments.num, arguments.seed, scenes)
-    covering, thin = robot.collision_spheres.radius, robot.self_collision_spheres.radius
-    print(f"{len(covering)} covering and {len(thin)} thin spheres")
-    for name, counts in (
-        ("against obstacles", measured.obstacles),
-        ("against itself", measured.self_collision),
-        ("in one count", measured.either),
-    ):
-        print(
-            f"{name}: {counts.misses} of {counts.colliding} collisions missed, "
-            f"{counts.false_alarms} false alarms in {counts.free} free configurations "
-            f"({100 * counts.false_alarm_rate:.2f} %)"
-        )
-    return EXIT_SOLVED
-
-
 def _meshes(robot):
     from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 
     spec = mesh_spec(robot)
     if spec is None:
         raise ValueError(
-            f"the meshes of '{robot.name}' are not on this machine; pip install "
+            f"the meshes of '{robot.name}' are not on this machine: "
             f"{install_hint(robot.mesh_source)}"
         )
     return spec
@@ -384,23 +340,6 @@ def _report(arguments: argparse.Namespace) -> int:
 
     page = tables.write_page([Path(file) for file in arguments.files], Path(arguments.out))
     print(f"wrote {page}")
-    return EXIT_SOLVED
-
-
-def _worlds(arguments: argparse.Namespace) -> int:
-    from vrrt_jax.bench.worlds import random_world
-    from vrrt_jax.robots import load_robot
-    from vrrt_jax.scene.obstacles import write_obstacles
-
-    robot, out = (
-        load_robot(arguments.robot, freeze=arguments.freeze),
-        Path(arguments.out),
-    )
-    for k in range(1, arguments.num + 1):
-        seed = arguments.seed + k
-        comment = f"Written by the command `vrrt worlds --robot {robot.name}`, seed {seed}."
-        write_obstacles(random_world(robot, seed), out / f"{robot.name}_{k}.xml", comment)
-    print(f"wrote {arguments.num} worlds to {out}")
     return EXIT_SOLVED
 
 

@@ -55,7 +55,7 @@ def _meshes(name: str) -> str:
     robot = load_robot(name)
     if mesh_spec(robot, visuals=False) is None:
         hint = install_hint(robot.mesh_source)
-        return f"none, so spheres are checked and drawn instead; pip install {hint}"
+        return f"none, so spheres are checked and drawn instead; {hint}"
     return str(mesh_file(robot.mesh_source))
 
 

@@ -15,6 +15,7 @@ from vrrt_jax.core.fields import check_fields
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots import Robot, load_robot, robot_names, scenes_dir
+from vrrt_jax.robots.robot_folder import SELF_MODEL
 from vrrt_jax.scene.obstacles import load_obstacles, write_obstacles
 from vrrt_jax.scene.world import World, build_world, held_names, obstacle_list
 from vrrt_jax.splat.camera_fields import camera_to_dict
@@ -167,19 +168,21 @@ def load_world(
 
 
 def self_model_path(robot: Robot, given: str | Path | None = None) -> Path:
-    """Where a robot's self-model is: the given file, or the packaged one.
+    """Where a robot's self-model is: the given file, or the one of its folder.
 
     Raises:
-        ValueError: none is given, and the robot is not a packaged one.
+        ValueError: none is given, and the robot was loaded from a file alone.
     """
     if given is not None:
         return Path(given)
+    if robot.folder is not None:
+        return robot.folder / SELF_MODEL
     if robot.mesh_source not in robot_names():
         raise ValueError(
-            f"the robot '{robot.name}' comes without a self-model; give --self-model, or train one "
-            "with: vrrt fit"
+            f"the robot '{robot.name}' comes without a self-model; make a folder with one with: "
+            "vrrt fit, and give that as the robot; or give --self-model"
         )
-    return scenes_dir() / "robots" / robot.name / "self_model.npz"
+    return scenes_dir() / "robots" / robot.name / SELF_MODEL
 
 
 def views_of(photos: Sequence[Photo]) -> dict[str, Any]:
@@ -216,14 +219,14 @@ def _checked_views(views: Any, file: Path) -> list[dict[str, Any]]:
 
 
 def _beside(folder: Path, name: Any, what: str) -> str:
-    """A file of a problem's folder, if it is there; otherwise the name as it is.
+    """A file or folder beside a problem's file, if it is there; otherwise the name as it is.
 
     Raises:
         ValueError: it is no text.
     """
     if not isinstance(name, str) or not name:
         raise ValueError(f"{what} is {name!r}; expected a name or a path")
-    return str(folder / name) if (folder / name).is_file() else name
+    return str(folder / name) if (folder / name).exists() else name
 
 
 def _vector(values: Sequence[float], what: str) -> np.ndarray:

@@ -44,7 +44,9 @@ def add_bench(kinds: Any) -> None:
 def add_robot(parser: argparse.ArgumentParser, required: bool = True) -> None:
     """Add the arguments that say which robot."""
     parser.add_argument(
-        "--robot", required=required, help="a packaged robot, or an MJCF or URDF file"
+        "--robot",
+        required=required,
+        help="a packaged robot, a folder of vrrt fit, or an MJCF or URDF file",
     )
     parser.add_argument(
         "--freeze", type=_joint_values, default=None, help="joints to fix, as name=0.04,name=0.04"
@@ -53,7 +55,9 @@ def add_robot(parser: argparse.ArgumentParser, required: bool = True) -> None:
 
 def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
     parser.set_defaults(run=_protocol)
-    parser.add_argument("--robot", required=True, help="panda, ur5e or fetch")
+    parser.add_argument(
+        "--robot", required=True, help="panda, ur5e or fetch, or a folder of vrrt fit"
+    )
     levels = "0.5,1.0,1.5,2.0,2.5"
     parser.add_argument(
         "--levels", type=_levels, default=levels, help="distances [rad], or random: any pairs"

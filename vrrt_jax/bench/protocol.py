@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from vrrt_jax.bench.methods import CONFIGS, METHODS
 from vrrt_jax.bench.problem_tasks import files_of, usable_problems
 from vrrt_jax.bench.runner import Benchmark, Variant
-from vrrt_jax.bench.tasks import RANDOM, ROBOTS, Scenery
+from vrrt_jax.bench.tasks import RANDOM, Scenery, bench_robot
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.scene.world import ENGINES
 
@@ -62,7 +62,7 @@ def benchmark(
 
     Args:
         what: "visual" (the paper's tasks), "pose" (no obstacles) or "ablation".
-        robot: one of :data:`~vrrt_jax.bench.tasks.ROBOTS`.
+        robot: one of :data:`~vrrt_jax.bench.tasks.ROBOTS`, or a folder of ``vrrt fit``.
         levels: distances from start to goal [rad], or "random" for any pairs.
         tasks_per_level: number of tasks at each.
         seed: of tasks and method.
@@ -80,8 +80,8 @@ def benchmark(
         FileNotFoundError: there are no problems in the folder.
         ValueError: a name is unknown, or a number makes no sense.
     """
+    bench_robot(robot)
     for name, value, known in (
-        ("robot", robot, ROBOTS),
         ("method", method, METHODS),
         ("config", config, CONFIGS),
         ("engine", engine, ENGINES),

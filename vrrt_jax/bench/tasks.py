@@ -3,27 +3,25 @@
 import dataclasses
 import functools
 import zlib
+from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.bench.arm_problems import ArmProblems, read_problems
 from vrrt_jax.bench.arm_trials import Refusal, pose_problem
-from vrrt_jax.core.edges import enforce_bounds
+from vrrt_jax.bench.worlds import random_world
 from vrrt_jax.problems import load_world
+from vrrt_jax.random_problem import AZIMUTH_DEG, free_pairs, front_camera
 from vrrt_jax.robots import Robot, load_robot
 from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
-from vrrt_jax.robots.robot import workspace
 from vrrt_jax.scene.obstacles import Obstacle
-from vrrt_jax.scene.verify import contacts, verify_path
+from vrrt_jax.scene.verify import verify_path
 from vrrt_jax.scene.world import (
     World,
-    batch_is_free,
     build_world,
     obstacle_list,
 )
-from vrrt_jax.splat.camera import orbit
 from vrrt_jax.splat.images import View
 from vrrt_jax.splat.mujoco_images import MeshRenderer, Picture
 from vrrt_jax.splat.photographs import Photograph, photograph
@@ -31,12 +29,8 @@ from vrrt_jax.splat.types import Camera
 
 ROBOTS = ("panda", "ur5e", "fetch")
 WORLDS_PER_ROBOT = 6
-MOST_DRAWS = 400  # of 256 pairs of ends each
 NUM_SLOTS = 12  # one shape for all worlds, so that none re-compiles
-IMAGE_PX = 480
-AZIMUTHS_DEG = (180.0, 90.0)  # of the first and the second view: from the front, from the right
-ELEVATION_DEG = -30.0
-DISTANCE = 2.1  # of the camera, in radii of the workspace
+AZIMUTHS_DEG = (AZIMUTH_DEG, 90.0)  # of the first and the second view: the front, the right
 SIDE = "side"  # the light of a lamp far away, to the left of the robot
 SHINES = (0.0, -0.87, -0.5)  # where that lamp shines
 RANDOM = "random"  # the level of pairs drawn anywhere inside the limits
@@ -75,19 +69,21 @@ class Task:
 
 @functools.cache
 def bench_robot(name: str) -> Robot:
-    """A robot of the benchmark.
+    """A robot of the benchmark: one of :data:`ROBOTS`, or a folder of ``vrrt fit``.
 
     Raises:
-        ValueError: the name is unknown.
+        ValueError: the name is unknown, or the folder is not whole.
     """
-    if name not in ROBOTS:
-        raise ValueError(f"unknown robot '{name}'; have: {', '.join(ROBOTS)}")
+    if name not in ROBOTS and not Path(name).expanduser().is_dir():
+        raise ValueError(
+            f"unknown robot '{name}'; have: {', '.join(ROBOTS)}, or give a folder of vrrt fit"
+        )
     return load_robot(name)
 
 
 @functools.cache
 def bench_world(robot: str, name: str, engine: str = "closed_form") -> World:
-    """A packaged world with the benchmark's number of slots, or an empty one.
+    """A packaged world with the benchmark's number of slots, a random or an empty one.
 
     Tasks are drawn in the world of the fast engine, so that they are the same for all engines.
     """
@@ -101,6 +97,9 @@ def bench_world(robot: str, name: str, engine: str = "closed_form") -> World:
         return trial.world
     if not name:
         return build_world(bench_robot(robot), [], **settings)
+    if robot not in ROBOTS:  # no worlds are packaged for it
+        seed = int(name.rpartition("_")[2])
+        return build_world(bench_robot(robot), random_world(bench_robot(robot), seed), **settings)
     return load_world(name, bench_robot(robot), **settings)
 
 
@@ -129,38 +128,23 @@ def make_task(
         ValueError: there seems to be no such task.
     """
     robot = bench_robot(robot_name)
-    name = f"{robot_name}_{1 + index % WORLDS_PER_ROBOT}" if obstacles else ""
+    name = f"{robot.name}_{1 + index % WORLDS_PER_ROBOT}" if obstacles else ""
     world = bench_world(robot_name, name)
-    listed = obstacle_list(world)
-    key = f"{robot_name} {level_name(level)} {index} {obstacles}"
+    key = f"{robot.name} {level_name(level)} {index} {obstacles}"
     rng = np.random.default_rng([seed, zlib.crc32(key.encode())])
-    for _ in range(MOST_DRAWS):
-        q_start = rng.uniform(robot.lower, robot.upper, (256, robot.num_joints))
-        if isinstance(level, str):
-            q_goal = rng.uniform(robot.lower, robot.upper, q_start.shape)
-        else:
-            step = rng.normal(size=q_start.shape)
-            q_goal = q_start + level * step / np.linalg.norm(step, axis=1, keepdims=True)
-        inside = robot.is_continuous | ((q_goal > robot.lower) & (q_goal < robot.upper))
-        q_goal = np.asarray(enforce_bounds(world, jnp.asarray(q_goal, jnp.float32)))
-        free = [
-            np.asarray(batch_is_free(world, jnp.asarray(q, jnp.float32))) for q in (q_start, q_goal)
-        ]
-        for i in np.flatnonzero(inside.all(1) & free[0] & free[1]):
-            ends = q_start[i].astype(np.float32), q_goal[i]
-            if any(contacts(robot, listed, q) for q in ends):
-                continue
-            is_blocked = straight_is_blocked(robot, world, *ends)
-            if hard and not is_blocked:
-                continue
-            return Task(
-                level=level,
-                index=index,
-                world=name,
-                q_start=ends[0],
-                q_goal=ends[1],
-                straight_is_blocked=is_blocked,
-            )
+    distance = None if isinstance(level, str) else level
+    for ends in free_pairs(robot, world, rng, distance):
+        is_blocked = straight_is_blocked(robot, world, *ends)
+        if hard and not is_blocked:
+            continue
+        return Task(
+            level=level,
+            index=index,
+            world=name,
+            q_start=ends[0],
+            q_goal=ends[1],
+            straight_is_blocked=is_blocked,
+        )
     raise ValueError(
         f"found no free start and goal of '{robot_name}' for the level {level_name(level)}; "
         "expected levels such as the paper's, 0.5 to 2.5 rad"
@@ -188,16 +172,9 @@ def problems_of(file: str, robot_name: str) -> ArmProblems:
 @functools.cache
 def cameras(robot_name: str, scenery: Scenery) -> tuple[Camera, ...]:
     """The views of a robot's workspace."""
-    center, radius = workspace(bench_robot(robot_name))
+    robot = bench_robot(robot_name)
     return tuple(
-        orbit(
-            azimuth_deg=azimuth + scenery.azimuth_deg,
-            elevation_deg=ELEVATION_DEG,
-            distance=DISTANCE * radius,
-            target=center.tolist(),
-            height=IMAGE_PX,
-            width=IMAGE_PX,
-        )
+        front_camera(robot, azimuth + scenery.azimuth_deg)
         for azimuth in AZIMUTHS_DEG[: scenery.views]
     )
 
@@ -236,8 +213,8 @@ def _renderer(robot_name: str, hiding: tuple[Obstacle, ...], from_side: bool) ->
     spec = mesh_spec(robot)
     if spec is None:
         raise ValueError(
-            f"goal images need the meshes of '{robot_name}', which are not on this machine: pip "
-            f"install {install_hint(robot.mesh_source)}"
+            f"goal images need the meshes of '{robot_name}', which are not on this machine: "
+            f"{install_hint(robot.mesh_source)}"
         )
     return MeshRenderer(spec, hiding, shines=SHINES if from_side else None)
 

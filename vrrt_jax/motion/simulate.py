@@ -95,7 +95,7 @@ def _model(robot: Robot) -> mujoco.MjModel:
     spec = inertial_spec(robot)
     if spec is None:
         raise ValueError(
-            f"the masses of robot '{robot.name}' are not on this machine: pip install "
+            f"the masses of robot '{robot.name}' are not on this machine: "
             f"{install_hint(robot.mesh_source)}"
         )
     spec.option.timestep = _STEP_S

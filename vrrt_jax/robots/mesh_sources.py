@@ -77,11 +77,12 @@ _SOURCES = {
 
 
 def install_hint(mesh_source: str | None) -> str:
-    """What to pip install for the true geometry of a robot."""
+    """What brings the true geometry of a robot to this machine."""
     source = _SOURCES.get(str(mesh_source))
     if source is None:
-        return _MENAGERIE
-    return f"{source.install}, and {source.tool.install}" if source.tool else source.install
+        return f"put '{mesh_source}' there again" if mesh_source else "load the robot's own file"
+    tool = f", and {source.tool.install}" if source.tool else ""
+    return f"pip install {source.install}{tool}"
 
 
 def frozen_joints(robot: "Robot") -> dict[str, float]:

@@ -12,7 +12,7 @@ from vrrt_jax.robots.names import free_name
 
 _TOOL = "tool_"  # two models may use a name twice
 _WRAPS_JOINT = mujoco.mjtWrap.mjWRAP_JOINT
-_SEEN, _HIDDEN = 1, 3  # groups of geoms: drawn, and not
+_SEEN, _HIDDEN = 1, 3  # groups of geoms: drawn, and not, as are those above
 
 
 def read_spec(path: Path, *, visuals: bool = False) -> mujoco.MjSpec:
@@ -20,7 +20,7 @@ def read_spec(path: Path, *, visuals: bool = False) -> mujoco.MjSpec:
 
     Args:
         path: an existing file.
-        visuals: keep what a URDF has for the eye, and hide what collides in its stead.
+        visuals: keep what a URDF has for the eye, and hide what collides where there is some.
 
     Raises:
         ValueError: the file is not readable as a robot.
@@ -29,7 +29,10 @@ def read_spec(path: Path, *, visuals: bool = False) -> mujoco.MjSpec:
     try:
         root = urdf.urdf_root(path)
         if root is None:
-            return _plain(mujoco.MjSpec.from_file(str(path)))
+            spec = _plain(mujoco.MjSpec.from_file(str(path)))
+            if visuals and _tells_apart(spec):
+                _hide_what_collides(spec)
+            return spec
     except ValueError as error:
         raise ValueError(_unreadable(path, error)) from None
     if visuals:
@@ -66,12 +69,26 @@ def read_inertial_spec(path: Path) -> mujoco.MjSpec:
 def _with_visuals(root: ElementTree.Element, path: Path) -> mujoco.MjSpec:
     """A URDF with the geoms that are for the eye; what collides is hidden where there are some."""
     spec = _plain(urdf.urdf_spec(root, path, visuals=True))
-    for body in spec.bodies:
-        if not all(map(_collides, body.geoms)):
-            for geom in body.geoms:
-                geom.group = _HIDDEN if _collides(geom) else _SEEN
+    for geom in spec.geoms:
+        if not _collides(geom):
+            geom.group = _SEEN
+    _hide_what_collides(spec)
     spec.copy().compile()  # the formats of many meshes are not read
     return spec
+
+
+def _tells_apart(spec: mujoco.MjSpec) -> bool:
+    """Whether the groups of a file's geoms tell what is for the eye from what collides."""
+    groups = {kind: {g.group for g in spec.geoms if _collides(g) == kind} for kind in (False, True)}
+    return bool(groups[False]) and groups[False].isdisjoint(groups[True])
+
+
+def _hide_what_collides(spec: mujoco.MjSpec) -> None:
+    """Hide, in place, the shapes that collide of bodies that have others for the eye."""
+    for body in spec.bodies:
+        if any(not _collides(geom) and geom.group < _HIDDEN for geom in body.geoms):
+            for geom in filter(_collides, body.geoms):
+                geom.group = _HIDDEN
 
 
 def _collides(geom: mujoco.MjsGeom) -> bool:

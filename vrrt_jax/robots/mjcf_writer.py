@@ -79,6 +79,13 @@ def collision_mjcf(
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
+def renamed(text: str, name: str) -> str:
+    """A written model under another name of the robot."""
+    root = ET.fromstring(text, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
+    root.set("model", name)
+    return ET.tostring(root, encoding="unicode") + "\n"
+
+
 def replace_spheres(text: str, fitted: str) -> str:
     """A written model with the spheres and the ignored pairs of another one.
 

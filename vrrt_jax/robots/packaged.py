@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from vrrt_jax.robots.robot_folder import model_file
+
 
 def scenes_dir() -> Path:
     """The folder of robots, worlds and problems.
@@ -28,14 +30,15 @@ def robot_names() -> list[str]:
 
 
 def robot_path(name_or_path: str | Path) -> Path:
-    """The MJCF or URDF file of a robot.
+    """The MJCF or URDF file of a robot; of a folder, its collision model.
 
     Args:
-        name_or_path: the name of a packaged robot, or a path to a file.
+        name_or_path: the name of a packaged robot, or a path to a file, or to a folder that
+            ``vrrt fit`` made.
 
     Raises:
         FileNotFoundError: the path leads to no file.
-        ValueError: the name is not known.
+        ValueError: the name is not known, or the folder is not whole.
     """
     text = str(name_or_path)
     if text in robot_names():
@@ -43,12 +46,14 @@ def robot_path(name_or_path: str | Path) -> Path:
     path = Path(name_or_path).expanduser()
     if path.is_file():
         return path
+    if path.is_dir():
+        return model_file(path)
     if path.suffix or len(path.parts) > 1:
         raise FileNotFoundError(
-            f"robot file '{text}' does not exist (or is a folder); pass the path of an MJCF or "
-            f"URDF file, or one of the packaged robots: {', '.join(robot_names())}"
+            f"robot file '{text}' does not exist; pass the path of an MJCF or URDF file, or of a "
+            f"folder from vrrt fit, or one of the packaged robots: {', '.join(robot_names())}"
         )
     raise ValueError(
         f"unknown robot '{text}'; have: {', '.join(robot_names())}; or pass the path of an MJCF "
-        "or URDF file"
+        "or URDF file, or of a folder from vrrt fit"
     )

@@ -55,6 +55,7 @@ class Robot:
     frozen: Mapping[str, float]  # joints of the true geometry that are fixed [rad] or [m]
     xml: str  # the collision model as MJCF; compiles by itself, without any mesh
     mesh_source: str | None  # name or file of the true geometry, see ``mesh_sources.mesh_spec``
+    folder: Path | None = None  # with its self-model; None for a robot of a file alone
 
     @property
     def num_joints(self) -> int:
@@ -64,21 +65,21 @@ class Robot:
 
 @single_precision
 def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None = None) -> Robot:
-    """Load a packaged robot, or any MJCF or URDF file with a fixed base.
+    """Load a packaged robot, a folder of ``vrrt fit``, or any MJCF or URDF file with a fixed base.
 
     Collision geoms that are spheres are used as they are; others are covered with spheres, which
     takes some seconds.
 
     Args:
-        name_or_path: a packaged robot, such as "panda", or a path.
+        name_or_path: a packaged robot, such as "panda", or the path of a file, or of a folder.
         freeze: joints to fix, and where [rad] or [m]. The fingers of packaged robots are fixed 4
             cm open; ``{"finger_joint1": 0.02, "finger_joint2": 0.02}`` closes the Panda's halfway.
 
     Raises:
         FileNotFoundError: the path leads to no file.
-        ValueError: the name is unknown, the file is unreadable, a mesh is nowhere, a joint cannot
-            be planned or its limits are unclear, or ``freeze`` names a joint that does not exist
-            or puts one outside of its range.
+        ValueError: the name is unknown, the file is unreadable, a mesh is nowhere, a folder is not
+            whole, a joint cannot be planned or its limits are unclear, or ``freeze`` names a joint
+            that does not exist or puts one outside of its range.
     """
     path = robot_path(name_or_path)
     spec = mjcf.read_spec(path)
@@ -108,6 +109,7 @@ def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None =
         model=mujoco.MjModel.from_xml_string(xml),
         ignored_pairs=tuple(ignored_pairs),
         xml=xml,
+        folder=None if path == Path(name_or_path).expanduser() else path.parent,
         **fields,
     )
 

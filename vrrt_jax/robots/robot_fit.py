@@ -56,8 +56,8 @@ def fit_spheres(
     spec = mesh_spec(robot, visuals=False)
     if spec is None:
         raise ValueError(
-            f"cannot fit spheres: the meshes of robot '{robot.name}' are not on this machine: pip "
-            f"install {install_hint(robot.mesh_source)}"
+            f"cannot fit spheres: the meshes of robot '{robot.name}' are not on this machine: "
+            f"{install_hint(robot.mesh_source)}"
         )
     model = spec.compile()
     rng = np.random.default_rng(seed)

@@ -272,7 +272,7 @@ def _build(
     spec = None if geometry == "spheres" else mesh_spec(robot, visuals=False)
     if spec is None and geometry == "meshes":
         raise ValueError(
-            f"the meshes of robot '{robot.name}' are not on this machine: pip install "
+            f"the meshes of robot '{robot.name}' are not on this machine: "
             f"{install_hint(robot.mesh_source)}, or use geometry='spheres'"
         )
     # True meshes where they are to be had, else the covering spheres.

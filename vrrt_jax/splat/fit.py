@@ -8,8 +8,10 @@ tool, whose turn an image of the whole robot hardly shows.
 import dataclasses
 import hashlib
 import json
+import math
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import mujoco
@@ -19,7 +21,7 @@ from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots.mesh_sources import mesh_file
 from vrrt_jax.splat.calibrate import calibrate
 from vrrt_jax.splat.fit_config import FitConfig, LevelConfig, check_fit_config
-from vrrt_jax.splat.fit_level import fit_level
+from vrrt_jax.splat.fit_level import better, fit_level
 from vrrt_jax.splat.model import Level, SelfModel, save_self_model
 from vrrt_jax.splat.training_images import (
     TrainingImages,
@@ -35,7 +37,14 @@ _Images = tuple[TrainingImages, TrainingImages, np.ndarray]
 
 @single_precision
 def fit_self_model(
-    robot, spec: mujoco.MjSpec, path: str | Path, *, seed: int, config: FitConfig
+    robot,
+    spec: mujoco.MjSpec,
+    path: str | Path,
+    *,
+    seed: int,
+    config: FitConfig,
+    earlier: SelfModel | None = None,
+    deadline: float = math.inf,
 ) -> SelfModel:
     """Train a self-model and write it, level by level.
 
@@ -48,11 +57,15 @@ def fit_self_model(
         path: where the ``.npz`` goes.
         seed: of poses, cameras and training.
         config: sizes and numbers of steps.
+        earlier: a self-model of the robot whose splats are trained on. A level of it stays as it
+            is if it does better on unseen images than what came of it.
+        deadline: when the time is up, of :func:`time.monotonic` [s].
 
     Returns:
         The self-model.
 
     Raises:
+        OutOfTime: at the deadline; the next call goes on.
         RuntimeError: OpenGL is not available.
         ValueError: a setting makes no sense, or ``<path>.work/`` belongs to another robot, seed or
             configuration.
@@ -62,27 +75,32 @@ def fit_self_model(
     work = path.with_name(path.name + ".work")
     _claim(work, robot, seed, config)
 
-    def fit(images: _Images, level: LevelConfig, name: str) -> Level:
+    def fit(images: _Images, level: LevelConfig, name: str, before: Level | None) -> Level:
         train, held_out, points = images
-        return fit_level(
+        found = fit_level(
             robot,
             train,
             held_out,
             points,
             level,
-            learning_rate=config.learning_rate,
+            learning_rate=config.learning_rate * (config.refining if before else 1.0),
             seed=seed,
             file=work / f"{name}.npz",
+            trained=before.splats if before else None,
+            deadline=deadline,
         )
+        return better(robot, held_out, before, found)
 
     # Levels for images of the whole robot, and then the one for close-ups of the outermost link.
     images = _, _, points = _cached_images(robot, spec, config, work, seed, None)
+    of_earlier = {level.size_px: level for level in (earlier.levels if earlier else ())}
     levels = []
     for level in config.levels:
         level = dataclasses.replace(level, num_splats=round(config.detail * level.num_splats))
-        levels.append(fit(images, level, f"level_{len(levels)}"))
+        before = of_earlier.get(level.size_px)
+        levels.append(fit(images, level, f"level_{len(levels)}", before))
     images = _cached_images(robot, spec, config, work, seed, outermost(points))
-    close_up = fit(images, config.close_up, "close_up")
+    close_up = fit(images, config.close_up, "close_up", earlier.close_up if earlier else None)
 
     uncalibrated = SelfModel(
         robot=robot.name,
@@ -90,13 +108,7 @@ def fit_self_model(
         levels=tuple(levels),
         close_up=close_up,
         seed=seed,
-        info={
-            "num_images": config.num_images,
-            "num_validation": config.num_validation,
-            "seconds": round(time.perf_counter() - started, 1),
-            "steps": [level.steps for level in (*config.levels, config.close_up)],
-            "versions": {"jax": jax.__version__, "mujoco": mujoco.__version__},
-        },
+        info=_info(config, earlier, time.perf_counter() - started),
     )
     model = calibrate(robot, spec, uncalibrated, seed=seed + 2, config=config)
     save_self_model(model, path)
@@ -104,6 +116,18 @@ def fit_self_model(
         file.unlink()
     work.rmdir()
     return model
+
+
+def _info(config: FitConfig, earlier: SelfModel | None, seconds: float) -> dict[str, Any]:
+    """How a self-model was trained, in all rounds together."""
+    before = earlier.info if earlier else {}
+    return {
+        "num_images": before.get("num_images", 0) + config.num_images,
+        "num_validation": config.num_validation,
+        "seconds": round(before.get("seconds", 0.0) + seconds, 1),
+        "steps": [level.steps for level in (*config.levels, config.close_up)],  # of the last round
+        "versions": {"jax": jax.__version__, "mujoco": mujoco.__version__},
+    }
 
 
 def _claim(work: Path, robot, seed: int, config: FitConfig) -> None:

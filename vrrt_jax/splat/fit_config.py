@@ -17,11 +17,11 @@ class LevelConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FitConfig:
-    """How a self-model is trained."""
+    """How a self-model is trained in one round."""
 
-    num_images: int = 400
-    num_surface_images: int = 150  # of the images, those with depth, to place the splats
-    num_validation: int = 60
+    num_images: int = 150
+    num_surface_images: int = 60  # of the images, those with depth, to place the splats
+    num_validation: int = 40
     image_px: int = 256  # height and width of the images [px]
     fovy_deg: tuple[float, float] = (40.0, 55.0)
     elevation_deg: tuple[float, float] = (-75.0, 5.0)
@@ -30,18 +30,33 @@ class FitConfig:
     distance: tuple[float, float] = (1.5, 2.6)
     target_spread: float = 0.15
     learning_rate: float = 0.1
+    refining: float = 0.3  # times this rate for splats of an earlier round
     detail: float = 1.0  # times the splats of all levels but the close-up; large robots need more
     levels: tuple[LevelConfig, ...] = (
-        LevelConfig(num_splats=300, size_px=32, steps=1000, batch=8),
-        LevelConfig(num_splats=600, size_px=64, steps=1500, batch=6),
-        LevelConfig(num_splats=1500, size_px=128, steps=600, batch=4),
-        LevelConfig(num_splats=5000, size_px=256, steps=300, batch=2),
+        LevelConfig(num_splats=300, size_px=32, steps=500, batch=8),
+        LevelConfig(num_splats=600, size_px=64, steps=700, batch=6),
+        LevelConfig(num_splats=1500, size_px=128, steps=250, batch=4),
+        LevelConfig(num_splats=5000, size_px=256, steps=80, batch=2),
     )
     # The close-up is a part of an image of `close_up_of_px`, around the outermost link. The part's
     # middle is at most `close_up_off` of its height away from the link.
-    close_up: LevelConfig = LevelConfig(num_splats=2400, size_px=96, steps=1500, batch=4)
+    close_up: LevelConfig = LevelConfig(num_splats=2400, size_px=96, steps=500, batch=4)
     close_up_of_px: int = 480
     close_up_off: float = 0.15
+
+
+# A first round that leaves a usable self-model soon. Plans compare images of up to 128 px, and the
+# close-up; the level of 256 px is for pictures.
+FIRST_ROUND = FitConfig(
+    num_images=120,
+    num_surface_images=50,
+    levels=(
+        LevelConfig(num_splats=300, size_px=32, steps=500, batch=8),
+        LevelConfig(num_splats=600, size_px=64, steps=600, batch=6),
+        LevelConfig(num_splats=1500, size_px=128, steps=200, batch=4),
+    ),
+    close_up=LevelConfig(num_splats=2400, size_px=96, steps=350, batch=4),
+)
 
 
 def check_fit_config(config: FitConfig) -> None:
@@ -53,6 +68,7 @@ def check_fit_config(config: FitConfig) -> None:
         "num_validation": (config.num_validation, 1),
         "number of levels": (len(levels), 1),
         "learning_rate": (config.learning_rate, 1e-9),
+        "refining": (config.refining, 1e-9),
         "close_up_of_px": (config.close_up_of_px, config.close_up.size_px),
     }
     for name, level in (levels | {"close_up": config.close_up}).items():

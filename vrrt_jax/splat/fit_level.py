@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import optax
 from tqdm import tqdm
 
 from vrrt_jax.core.files import replacing
-from vrrt_jax.robots.kinematics import link_poses
+from vrrt_jax.robots.kinematics import Chain, link_poses
 from vrrt_jax.splat.fit_config import LevelConfig
 from vrrt_jax.splat.initial_splats import initial_splats
 from vrrt_jax.splat.loss import image_loss, psnr_db
@@ -24,7 +24,12 @@ from vrrt_jax.splat.types import SplatModel
 
 CHECKPOINT_STEPS = 50
 TRAINED = ("mean", "radius", "density", "rgb", "view_color_gradient", "tau")
+ADAM = optax.scale_by_adam(b1=0.9, b2=0.99)
 MIN_TAU = 0.03  # [m] the softness of occlusion stays above this
+
+
+class OutOfTime(Exception):
+    """The time for training is up; what was done is kept in a checkpoint."""
 
 
 def fit_level(
@@ -37,6 +42,8 @@ def fit_level(
     learning_rate: float,
     seed: int,
     file: Path,
+    trained: SplatModel | None = None,
+    deadline: float = math.inf,
 ) -> Level:
     """Train the splats of one level of detail.
 
@@ -49,14 +56,17 @@ def fit_level(
         learning_rate: of the first step.
         seed: of the start and the order of the images.
         file: the checkpoint. A training that was interrupted goes on from it.
+        trained: splats of an earlier round to start from, instead of from the points.
+        deadline: when the time is up, of :func:`time.monotonic` [s].
+
+    Raises:
+        OutOfTime: at the deadline; the checkpoint is written.
     """
     train, held_out = shrink(train, level.size_px), shrink(held_out, level.size_px)
-    start = initial_splats(points, level.num_splats, seed)
+    start = initial_splats(points, level.num_splats, seed) if trained is None else trained
     change = {name: jnp.zeros_like(getattr(start, name)) for name in TRAINED}
-    schedule = optax.cosine_decay_schedule(learning_rate, level.steps, 0.02)
-    optimizer = optax.adam(schedule, b1=0.9, b2=0.99)
-    state = optimizer.init(change)
-    step = _training_step(robot, start, optimizer, level.batch)
+    rate = optax.cosine_decay_schedule(learning_rate, level.steps, 0.02)
+    state = ADAM.init(change)
 
     # Each step takes the first images of an order of its own, which does not depend on where the
     # training was interrupted.
@@ -73,8 +83,12 @@ def fit_level(
         unit="step",
     )
     for i in progress:
-        change, state, value = step(change, state, *_batch(train, order[i, : level.batch]))
-        if (i + 1) % CHECKPOINT_STEPS == 0:
+        if time.monotonic() > deadline:
+            _store_checkpoint(file, change, state, i)
+            raise OutOfTime
+        images = _batch(train, order[i, : level.batch])
+        change, state, value = _step(robot.chain, start, change, state, rate(i), *images)
+        if (i + 1) % CHECKPOINT_STEPS == 0 or i + 1 == level.steps:
             progress.set_postfix_str(f"{psnr_db(float(value)):.1f} dB")
             _store_checkpoint(file, change, state, i + 1)
 
@@ -86,6 +100,15 @@ def fit_level(
         psnr_db=round(psnr_db(float(losses.mean())), 2),
         match_threshold=math.nan,  # until it is calibrated
     )
+
+
+def better(robot, held_out: TrainingImages, before: Level | None, found: Level) -> Level:
+    """Of two levels for images of one size, the one that does better on unseen images."""
+    if before is None:
+        return found
+    losses = _validate(robot, before.splats, shrink(held_out, before.size_px))
+    before = dataclasses.replace(before, psnr_db=round(psnr_db(float(losses.mean())), 2))
+    return max(before, found, key=lambda level: level.psnr_db)
 
 
 def _assemble(start: SplatModel, change: dict[str, jax.Array]) -> SplatModel:
@@ -101,29 +124,26 @@ def _assemble(start: SplatModel, change: dict[str, jax.Array]) -> SplatModel:
     )
 
 
-def _training_step(
-    robot, start: SplatModel, optimizer: optax.GradientTransformation, num: int
-) -> Callable:
-    """A compiled step: changes, optimizer's state and a batch to new changes, state and loss."""
+@jax.jit
+def _step(chain: Chain, start: SplatModel, change, state, rate, *batch):
+    """Changes, optimizer's state and the mean loss after a step on a batch of images.
 
-    def loss(change, q, camera, rgb, alpha):
-        image = render(_assemble(start, change), link_poses(robot.chain, q), camera)
-        return image_loss(*image, rgb, alpha, jnp.ones_like(alpha))
+    All numbers are arguments, so that one program serves all rounds of training.
+    """
 
-    @jax.jit
-    def step(change, state, *batch):
-        # One image after the other, with the memory of one.
-        def add(total, example):
-            value, gradient = jax.value_and_grad(loss)(change, *example)
-            return jax.tree.map(jnp.add, total, (value, gradient)), None
+    def loss(change, *image):
+        return _loss(chain, _assemble(start, change), *image)
 
-        zero = (jnp.float32(0), jax.tree.map(jnp.zeros_like, change))
-        (value, gradient), _ = jax.lax.scan(add, zero, batch)
-        gradient = jax.tree.map(lambda g: g / num, gradient)
-        updates, state = optimizer.update(gradient, state)
-        return optax.apply_updates(change, updates), state, value / num
+    # One image after the other, with the memory of one.
+    def add(total, image):
+        return jax.tree.map(jnp.add, total, jax.value_and_grad(loss)(change, *image)), None
 
-    return step
+    zero = (jnp.float32(0), jax.tree.map(jnp.zeros_like, change))
+    sums, _ = jax.lax.scan(add, zero, batch)
+    value, gradient = jax.tree.map(lambda total: total / len(batch[0]), sums)
+    updates, state = ADAM.update(gradient, state)
+    change = jax.tree.map(lambda c, update: c - rate * update, change, updates)
+    return change, state, value
 
 
 def _batch(images: TrainingImages, rows: np.ndarray | int) -> tuple[Any, ...]:
@@ -138,13 +158,14 @@ def _batch(images: TrainingImages, rows: np.ndarray | int) -> tuple[Any, ...]:
 
 def _validate(robot, splats: SplatModel, images: TrainingImages) -> np.ndarray:
     """Losses (n,) at the true poses, in the light of training."""
+    views = (_batch(images, i) for i in range(len(images.q)))
+    return np.array([float(_loss(robot.chain, splats, *view)) for view in views])
 
-    @jax.jit
-    def loss(q, camera, rgb, alpha):
-        image = render(splats, link_poses(robot.chain, q), camera)
-        return image_loss(*image, rgb, alpha, jnp.ones_like(alpha))
 
-    return np.array([float(loss(*_batch(images, i))) for i in range(len(images.q))])
+@jax.jit
+def _loss(chain: Chain, splats: SplatModel, q, camera, rgb, alpha) -> jax.Array:
+    image = render(splats, link_poses(chain, q), camera)
+    return image_loss(*image, rgb, alpha, jnp.ones_like(alpha))
 
 
 def _store_checkpoint(file: Path, change, state, steps: int) -> None:
