@@ -92,14 +92,16 @@ def fit_self_model(
         return better(robot, held_out, before, found)
 
     # Levels for images of the whole robot, and then the one for close-ups of the outermost link.
-    images = _, _, points = _cached_images(robot, spec, config, work, seed, None)
+    # All rounds are validated with the same images, so that their figures can be compared.
+    first = earlier.seed if earlier else seed
+    images = _, _, points = _cached_images(robot, spec, config, work, (seed, first + 1), None)
     of_earlier = {level.size_px: level for level in (earlier.levels if earlier else ())}
     levels = []
     for level in config.levels:
         level = dataclasses.replace(level, num_splats=round(config.detail * level.num_splats))
         before = of_earlier.get(level.size_px)
         levels.append(fit(images, level, f"level_{len(levels)}", before))
-    images = _cached_images(robot, spec, config, work, seed, outermost(points))
+    images = _cached_images(robot, spec, config, work, (seed, first + 1), outermost(points))
     close_up = fit(images, config.close_up, "close_up", earlier.close_up if earlier else None)
 
     uncalibrated = SelfModel(
@@ -107,7 +109,7 @@ def fit_self_model(
         joint_names=robot.joint_names,
         levels=tuple(levels),
         close_up=close_up,
-        seed=seed,
+        seed=first,
         info=_info(config, earlier, time.perf_counter() - started),
     )
     model = calibrate(robot, spec, uncalibrated, seed=seed + 2, config=config)
@@ -153,7 +155,9 @@ def _claim(work: Path, robot, seed: int, config: FitConfig) -> None:
     file.write_text(stamp)
 
 
-def _cached_images(robot, spec, config: FitConfig, work: Path, seed: int, tip) -> _Images:
+def _cached_images(
+    robot, spec, config: FitConfig, work: Path, seeds: tuple[int, int], tip
+) -> _Images:
     """Images for training and for validation, and surface points; close-ups if there is a tip."""
     kind = "whole" if tip is None else "close_up"
 
@@ -163,6 +167,6 @@ def _cached_images(robot, spec, config: FitConfig, work: Path, seed: int, tip) -
             write_images(file, *render_images(robot, spec, config, *numbers, tip=tip))
         return read_images(file)
 
-    train, points = cached("train", config.num_images, seed, config.num_surface_images)
-    held_out, _ = cached("held_out", config.num_validation, seed + 1)
+    train, points = cached("train", config.num_images, seeds[0], config.num_surface_images)
+    held_out, _ = cached("held_out", config.num_validation, seeds[1])
     return train, held_out, points

@@ -48,7 +48,7 @@ class SelfModel:
     joint_names: tuple[str, ...]
     levels: tuple[Level, ...]  # by rising size
     close_up: Level  # for a part of a larger image around the outermost link
-    seed: int
+    seed: int  # of the first round of training
     info: dict[str, Any]  # how it was trained: numbers of images, steps, seconds, versions
 
     def level_for(self, height_px: int) -> Level:

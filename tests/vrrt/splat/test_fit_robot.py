@@ -96,7 +96,8 @@ def test_training_goes_on_where_it_was(made, tmp_path):
     after = vrrt_jax.load_self_model(folder / "self_model.npz")
     assert record.rounds == 2 and after.info["num_images"] == 28
     assert not np.array_equal(after.levels[0].splats.mean, before.levels[0].splats.mean)
-    assert min(after.levels[0].psnr_db, after.close_up.psnr_db) > 15
+    assert after.levels[0].psnr_db > before.levels[0].psnr_db - 0.1  # on the same images
+    assert after.close_up.psnr_db > before.close_up.psnr_db - 0.1
     assert not list(folder.glob("*.work"))
 
 
