@@ -18,7 +18,7 @@ from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning import features, local_map
 from nrp_jax.learning.data import Dataset
 from nrp_jax.learning.expert import GOOD_RATIO
-from nrp_jax.learning.models import ModelConfig
+from nrp_jax.learning.models import GLOBAL_CVAE, ModelConfig
 from nrp_jax.scene.field import DistanceField, make_field
 from nrp_jax.scene.robots import MobileRobot, batch_link_features
 from vrrt_jax.core.types import pytree
@@ -113,17 +113,24 @@ def load_examples(
             is 1 for good waypoints and 0 for others.
 
     Raises:
-        ValueError: the data set is of another task.
+        ValueError: the data set is of another task, or of rows that such a model does not learn
+            from.
     """
     if dataset.settings.task != config.task:
         raise ValueError(
             f"the data set is of task '{dataset.settings.task}', the model of '{config.task}'; "
             "give another data set, or the other --task"
         )
+    if dataset.settings.paths != (config.kind == GLOBAL_CVAE):
+        holds, option = ("paths", "without") if dataset.settings.paths else ("waypoints", "with")
+        raise ValueError(
+            f"the data set holds {holds}, but a '{config.kind}' learns from other rows; give one "
+            f"that nrp data wrote {option} --paths, or another --model"
+        )
     rows = dataset.rows
     # Which rows, and how good their waypoints are.
     good = rows["ratio"] <= GOOD_RATIO
-    if config.kind == "cvae":
+    if config.kind != "discriminator":
         rows = {name: column[good] for name, column in rows.items()}
         target = weight = np.ones(good.sum())
     else:
