@@ -198,9 +198,7 @@ def make_sampler(model: Model, **settings: Any) -> Any:
 
 
 @single_precision
-def load_sampler(
-    task: str, kind: str, path: str | Path | None = None, **settings: Any
-) -> Any:
+def load_sampler(task: str, kind: str, path: str | Path | None = None, **settings: Any) -> Any:
     """Load a sampler's weights.
 
     Args:

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import json
 import os
 import signal
 import subprocess
@@ -14,11 +15,15 @@ import numpy as np
 import pytest
 from nrp_synthetic import synthetic_rows
 
+from nrp_jax.cli import main
 from nrp_jax.learning import train as training
 from nrp_jax.learning.batches import load_examples, make_batch, make_examples
 from nrp_jax.learning.checkpoint import load_model
+from nrp_jax.learning.data import Dataset
 from nrp_jax.learning.models import ModelConfig
-from nrp_jax.learning.train import TrainConfig, check_settings, split_by_home, train
+from nrp_jax.learning.recipe import TrainConfig, check_settings, make_optimizer
+from nrp_jax.learning.shards import DatasetSettings
+from nrp_jax.learning.train import split_by_home, train
 
 SETTINGS = TrainConfig(epochs=16, batch=48, patience=16)
 SMALL = {"channels": (16, 32), "context": 64, "width": 32}  # networks that train in seconds
@@ -127,6 +132,41 @@ def test_the_generator_learns(rows, tmp_path):
     batch = compiled(config, robot, examples, np.arange(len(examples.home)))
     spread = np.asarray(batch.waypoints)[np.asarray(batch.weight) > 0].var(axis=0).mean()
     assert -model.info["best"]["quality"] < 0.9 * spread
+
+
+@pytest.mark.light_compilation
+def test_the_published_recipe_trains_by_the_command(tmp_path, monkeypatch, rows):
+    """Its settings are those of the paper's code; options overrule them."""
+    columns = {**rows[2], "ratio": np.where(rows[2]["good"], 1.0, np.inf)}
+    dataset = Dataset(settings=DatasetSettings(task="snake"), grids=rows[1], rows=columns)
+    monkeypatch.setattr(training, "load_dataset", lambda _: dataset)
+    monkeypatch.setattr(training, "fingerprint", lambda _: "synthetic")
+    command = ["train", "--task", "snake", "--model", "discriminator", "--data", "none"]
+    command += ["--architecture", "published", "--epochs", "1", "--out", str(tmp_path)]
+    assert main(command) == 0
+    assert load_model(tmp_path).config == ModelConfig.published("snake", "discriminator")
+    settings = json.loads((tmp_path / "training.json").read_text())["settings"]
+    assert settings["epochs"] == 1 and settings["batch"] == 16 and settings["plateau"] == 5000
+    assert settings["learning_rate"] == 1e-3 and settings["weight_decay"] == 5e-4
+    assert not settings["augment"] and settings["patience"] == 50
+    model = load_model(tmp_path)
+    assert model.info["data"].endswith("soft False")
+    assert "batch_stats" in model.variables and model.info["best"]["quality"] > 0.5
+    assert TrainConfig.published("fetch", "cvae").epochs == 100
+    with pytest.raises(ValueError, match="unknown task 'panda'"):
+        TrainConfig.published("panda", "cvae")
+
+
+def test_the_rate_halves_on_a_plateau():
+    settings = dataclasses.replace(TrainConfig.published("snake", "cvae"), plateau=3)
+    optimizer = make_optimizer(settings, steps=100)
+    params = {"w": np.ones(1, np.float32)}
+    state, sizes = optimizer.init(params), []
+    for _ in range(8):
+        update, state = optimizer.update(params, state, params, value=1.0)
+        sizes.append(-float(update["w"][0]))
+    assert sizes[0] == pytest.approx(1e-3, rel=1e-3)
+    assert sizes[-1] == pytest.approx(sizes[0] / 4, rel=1e-2)
 
 
 def test_settings_and_data_of_another_task_are_refused():
