@@ -23,6 +23,10 @@ from nrp_jax.scene.field import DistanceField, make_field
 from nrp_jax.scene.robots import MobileRobot, batch_link_features
 from vrrt_jax.core.types import pytree
 
+# Each query that is turned by itself is turned by all quarters, of which one is kept.
+LARGE_IMAGE = 100_000  # cells
+LIMITS = np.array([[4], [2]])  # of quarter turns, and of mirrors
+
 
 @pytree
 class Examples:
@@ -211,16 +215,22 @@ def make_batch(
         robot: whose configurations they are.
         examples: training rows.
         chosen: (n,) indices of queries.
-        key: turns and mirrors each query at random, if given. Homes have no preferred direction,
-            so that a query stands for eight.
+        key: turns and mirrors each query at random, if given; queries with images of more than
+            ``LARGE_IMAGE`` cells all alike. Homes have no preferred direction, so that a query
+            stands for eight.
     """
     # Images, configurations and link frames in the local frames.
     image, q, points = jax.vmap(lambda index: _local(config, examples, index))(chosen)
     if key is not None:
         # One of the eight symmetries of a square for each query.
-        symmetry = jax.random.randint(key, (2, len(chosen)), 0, jnp.array([[4], [2]]))
-        quarter, mirror = symmetry[0], symmetry[1] == 1
-        image = jax.vmap(features.turn_image)(image, quarter, mirror)
+        alike = image[0].size > LARGE_IMAGE
+        symmetry = jax.random.randint(key, (2, 1 if alike else len(chosen)), 0, LIMITS)
+        symmetry = symmetry[0], symmetry[1] == 1
+        if alike:
+            image = jax.vmap(lambda one: features.turn_image(one, *(s[0] for s in symmetry)))(image)
+        else:
+            image = jax.vmap(features.turn_image)(image, *symmetry)
+        quarter, mirror = (jnp.broadcast_to(s, len(chosen)) for s in symmetry)
         q = jax.vmap(lambda *a: features.turn_configuration(robot, *a))(q, quarter, mirror)
         points = jax.vmap(features.turn_points)(points, quarter, mirror)
     described = describe(config, robot, q, points)

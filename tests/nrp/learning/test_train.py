@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import itertools
 import json
 import os
 import signal
@@ -13,9 +14,10 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from nrp_synthetic import synthetic_rows
+from nrp_synthetic import random_grid, synthetic_rows
 
 from nrp_jax.cli import main
+from nrp_jax.learning import features
 from nrp_jax.learning import train as training
 from nrp_jax.learning.batches import load_examples, make_batch, make_examples
 from nrp_jax.learning.checkpoint import load_model
@@ -24,6 +26,7 @@ from nrp_jax.learning.models import ModelConfig
 from nrp_jax.learning.recipe import TrainConfig, check_settings, make_optimizer
 from nrp_jax.learning.shards import DatasetSettings
 from nrp_jax.learning.train import split_by_home, train
+from nrp_jax.scene.robots import load_robot
 
 SETTINGS = TrainConfig(epochs=16, batch=48, patience=16)
 SMALL = {"channels": (16, 32), "context": 64, "width": 32}  # networks that train in seconds
@@ -58,6 +61,31 @@ def test_rows_of_a_query_stay_together(rows):
         same = (columns["q_start"] == np.asarray(examples.q[k, 0])).all(1) & good
         kept = np.asarray(examples.q[k, 2:])[np.asarray(examples.weight[k]) > 0]
         np.testing.assert_array_equal(kept, columns["waypoint"][same])
+
+
+@pytest.mark.light_compilation
+def test_large_maps_are_turned_all_alike():
+    """With what stands in them, by the same one of eight symmetries."""
+    robot, grid = load_robot("fetch"), random_grid(0, size=60, height=20)
+    config = ModelConfig.default("fetch", "global-cvae")
+    q = np.random.default_rng(0).uniform(1.0, 5.0, (3, 11)).astype(np.float32)
+    rows = {"q_start": q, "q_goal": q, "waypoint": q, "home": np.zeros(3), "query": np.arange(3)}
+    examples = make_examples(config, robot, [grid], rows, target=np.ones(3), weight=np.ones(3))
+    compiled = jax.jit(make_batch, static_argnums=0)
+    plain = compiled(config, robot, examples, np.arange(3))
+    for seed in range(3):
+        turned = compiled(config, robot, examples, np.arange(3), jax.random.key(seed))
+        found = []
+        for quarter, mirror in itertools.product(range(4), (False, True)):
+            image = features.turn_image(plain.image[0], np.int32(quarter), np.bool_(mirror))
+            if np.array_equal(image, turned.image[0]):
+                found.append((quarter, mirror))
+        (quarter, mirror), sign = found[0], 1 - 2 * found[0][1]
+        assert len(found) == 1 and np.array_equal(turned.image[1], turned.image[0])
+        place = np.asarray(plain.start[:, :2]) * [1, sign]
+        for _ in range(quarter):
+            place = np.stack([-place[:, 1], place[:, 0]], axis=1)
+        np.testing.assert_allclose(turned.start[:, :2], place, atol=1e-5)
 
 
 def test_homes_are_held_out_whole():
