@@ -8,11 +8,11 @@ import pytest
 from nrp_synthetic import between, free, path_lengths
 
 from nrp_jax.cli import main
+from nrp_jax.homes.houses import generate_house
 from nrp_jax.learning import data, shards
 from nrp_jax.learning.batches import load_examples
 from nrp_jax.learning.models import ModelConfig
 from nrp_jax.learning.paths import make_path_rows
-from nrp_jax.scene.robots import load_robot
 
 QUERIES, STATES = 12, 5
 TOLERANCE = 2e-3  # of states, [m] and [rad]: lengths are float32
@@ -56,46 +56,29 @@ def test_states_lie_evenly_on_shortest_paths(world, roadmap, rows):
             assert step < TOLERANCE
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A set of paths, written by the command."""
-    out = tmp_path_factory.mktemp("paths") / "set"
-    command = ["data", "--task", "snake", "--paths", "--homes", "1", "--test-homes", "0"]
-    command += ["--queries", "6", "--waypoints", "4", "--nodes", "500", "--jobs", "1"]
-    assert main([*command, "--out", str(out)]) == 0
-    return out
-
-
-def test_each_model_learns_from_its_own_rows_alone(folder, tmp_path, capsys):
-    dataset = data.load_dataset(folder)
-    assert dataset.settings.paths and len(dataset) == 24
-    robot = load_robot("snake")
+def test_each_model_learns_from_its_own_rows_alone(robot, world, rows):
+    columns = {**vars(rows), "home": np.zeros(len(rows.ratio), np.int32)}
+    settings = shards.DatasetSettings(task="snake", paths=True)
+    grids = [generate_house(3).grid]
+    dataset = data.Dataset(settings=settings, grids=grids, rows=columns)
     examples = load_examples(ModelConfig.default("snake", "global-cvae"), robot, dataset)
-    assert examples.q.shape == (6, 6, 8) and np.all(examples.weight == 1.0)
+    assert examples.q.shape == (QUERIES, 2 + STATES, 8) and np.all(examples.weight == 1.0)
     for kind in ("cvae", "discriminator"):
         with pytest.raises(ValueError, match=f"holds paths, but a '{kind}' learns .* without"):
             load_examples(ModelConfig.default("snake", kind, "map"), robot, dataset)
-    waypoints = dataclasses.replace(
-        dataset, settings=dataclasses.replace(dataset.settings, paths=False)
-    )
+    dataset = dataclasses.replace(dataset, settings=shards.DatasetSettings(task="snake"))
     with pytest.raises(ValueError, match="holds waypoints, but a 'global-cvae' .* with --paths"):
-        load_examples(ModelConfig.default("snake", "global-cvae"), robot, waypoints)
-    command = ["train", "--task", "snake", "--data", str(folder), "--out", str(tmp_path / "out")]
-    assert main([*command, "--model", "cvae"]) == 2
-    assert "the data set holds paths" in capsys.readouterr().err
+        load_examples(ModelConfig.default("snake", "global-cvae"), robot, dataset)
 
 
-def test_paths_and_waypoints_never_mix(folder, tmp_path):
-    settings = data.load_dataset(folder).settings
-    waypoints = dataclasses.replace(settings, paths=False)
-    with pytest.raises(ValueError, match="was made with paths True, not False"):
-        data.write_dataset(folder, waypoints, homes=1, test_homes=0)
+def test_paths_and_waypoints_never_mix(tmp_path, capsys):
+    waypoints = shards.DatasetSettings(task="snake")
+    data.write_dataset(tmp_path, waypoints, homes=0, test_homes=0)
     # Sets from before there were paths hold waypoints.
-    manifest = json.loads((folder / data.MANIFEST).read_text())
-    manifest |= {"shards": {}, "rows": 0}
-    del manifest["settings"]["paths"]
+    manifest = json.loads((tmp_path / data.MANIFEST).read_text())
+    assert manifest["settings"].pop("paths") is False
     (tmp_path / data.MANIFEST).write_text(json.dumps(manifest))
     data.write_dataset(tmp_path, waypoints, homes=0, test_homes=0)
-    with pytest.raises(ValueError, match="was made with paths False, not True"):
-        data.write_dataset(tmp_path, settings, homes=0, test_homes=0)
-    assert shards.DatasetSettings(task="snake").paths is False
+    command = ["data", "--task", "snake", "--out", str(tmp_path), "--jobs", "1"]
+    assert main([*command, "--paths"]) == 2
+    assert "was made with paths False, not True" in capsys.readouterr().err
