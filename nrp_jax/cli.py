@@ -52,9 +52,9 @@ def _add_plan(commands) -> None:
     plan.add_argument("--goal", type=command.numbers, help="as --goal=...")
     plan.add_argument(
         "--method",
-        help="nrp-connect (default), rrt, rrt-is, rrt-connect, nrp-d or nrp-g; or, to shorten the "
-        "path until the budget ends, bit-star, rrt-star, irrt-star, nrp-star-d, nrp-star-g or "
-        "nrp-star-connect",
+        help="nrp-connect (default), rrt, rrt-is, rrt-connect, cvae-rrt, nrp-d or nrp-g; or, to "
+        "shorten the path until the budget ends, bit-star, rrt-star, irrt-star, cvae-irrt-star, "
+        "nrp-star-d, nrp-star-g or nrp-star-connect",
     )
     plan.add_argument("--model", help="what nrp train wrote; packaged weights by default")
     plan.add_argument("--crop", type=command.numbers, help="plan in x0,y0,x1,y1 of the map [m]")

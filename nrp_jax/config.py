@@ -13,6 +13,7 @@ class PlannerConfig:
 
     goal_bias: float = setting(0.3, 0.0, 1.0)  # share of expansions that aim at the goal
     straight_rate: float = setting(0.2, 0.0, 1.0)  # share that goes straight, with a sampler
+    uniform_share: float = setting(0.5, 0.0, 1.0)  # of the samples of cvae-rrt and cvae-irrt-star
     lanes: int = setting(32, 1, 4096)  # expansions at a time; rrt-connect takes two at least
     capacity: int = setting(8192, 3, 1 << 24)  # nodes of the tree that there is room for at first
     max_capacity: int = setting(1 << 20, 3, 1 << 24)  # a full tree gets more room, up to this

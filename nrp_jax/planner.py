@@ -82,7 +82,8 @@ def plan(
             packaged networks fit robot and map, otherwise "rrt-connect".
         method: another word for ``planner``.
         sampler: what proposes waypoints to the "nrp-" planners: a pytree with ``propose(world,
-            q_from, q_goal, key)``; the packaged weights by default.
+            q_from, q_goal, key)``. For the "cvae-" planners, what draws samples: a pytree with
+            ``draw(world, q_start, q_goal, num, key)``. The packaged weights by default.
         world: of this robot and grid, to save building it again; its ``is_free`` is obeyed.
         scene: the exact scene of this robot and grid, to save building it again.
         config: settings, the default ones if None.

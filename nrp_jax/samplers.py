@@ -1,6 +1,7 @@
 """Learned samplers: they propose waypoints for many starts and goals at once.
 
-A waypoint is a configuration near the start from which the goal is easier to reach. Samplers are
+A waypoint is a configuration near the start from which the goal is easier to reach. Samplers that
+generate are in :mod:`nrp_jax.generators`; among them one that samples whole paths. Samplers are
 pytrees, so that other weights never re-compile a planner. Letters: ``B`` lanes, ``C`` candidates,
 ``D`` joints, ``F`` link frames, ``K`` waypoints of a lane.
 """
@@ -12,13 +13,15 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
+from nrp_jax.generators import CVAESampler, Generator, GlobalCVAESampler
 from nrp_jax.homes.grid import HEIGHT, RESOLUTION
+from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning import features
 from nrp_jax.learning.batches import describe, read_image, relations
 from nrp_jax.learning.checkpoint import Model, build_module, check_model, load_model
 from nrp_jax.learning.edge_check import first_free
 from nrp_jax.learning.local_map import SIDE
-from nrp_jax.learning.models import CVAE, ModelConfig, check_choices
+from nrp_jax.learning.models import GLOBAL_CVAE, ModelConfig, check_choices
 from nrp_jax.learning.network_inputs import NetworkInputs, network_inputs
 from nrp_jax.scene.robots import MobileRobot, batch_link_features, load_robot
 from nrp_jax.scene.world import GridWorld
@@ -148,39 +151,6 @@ class DiscriminatorSampler:
         )
 
 
-@pytree
-class CVAESampler:
-    """NRP-g: the CVAE's decoder makes waypoints of random latents."""
-
-    robot: MobileRobot
-    variables: Any  # weights, flax variables
-    config: ModelConfig = static()
-    num_outputs: int = static()  # features that the decoder writes
-    # So many waypoints are made, and their edges checked; the first that is free is taken.
-    num_edge_checked: int = static(default=8)
-    edge_checks: int = static(default=12)  # configurations checked along each of these edges
-
-    def propose(
-        self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
-    ) -> jax.Array:
-        """See :class:`Sampler`."""
-        return self.propose_and_count(world, q_from, q_goal, key)[0]
-
-    def propose_and_count(
-        self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Waypoints as :meth:`propose` makes them, and how many configurations it checked."""
-        inputs = network_inputs(self.config, self.robot, world, q_from, q_goal)
-        z = jax.random.normal(key, (len(q_from), self.num_edge_checked, self.config.latent))
-        module: Any = build_module(self.config, self.num_outputs)
-        made = module.apply(
-            self.variables, inputs.image, inputs.start, inputs.goal, z, method=CVAE.decode
-        )
-        q = features.to_configuration(self.config, self.robot, made)
-        q = enforce_bounds(world, features.to_world(q, inputs.center[:, None]))
-        return first_free(world, q_from, q, self.edge_checks)
-
-
 def proposed(
     sampler: Any, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
 ) -> tuple[jax.Array, Any]:
@@ -212,32 +182,34 @@ def _postures(
 
 
 @single_precision
-def make_sampler(model: Model, **settings: Any) -> DiscriminatorSampler | CVAESampler:
-    """Make a sampler of a trained model.
+def make_sampler(model: Model, **settings: Any) -> Any:
+    """Make a sampler of a trained model, of the class that its kind asks for.
 
     Args:
         model: from :func:`nrp_jax.learning.checkpoint.load_model` or a training.
-        settings: fields of :class:`DiscriminatorSampler` or :class:`CVAESampler`.
+        settings: fields of the sampler's class.
     """
     robot, config = load_robot(model.config.task), model.config
     shared = {"robot": robot, "variables": model.variables, "config": config, **settings}
     if config.kind == "discriminator":
         return DiscriminatorSampler(**shared)
-    return CVAESampler(num_outputs=model.info["num_outputs"], **shared)
+    make = GlobalCVAESampler if config.kind == GLOBAL_CVAE else CVAESampler
+    return make(num_outputs=model.info["num_outputs"], **shared)
 
 
 @single_precision
-def load_sampler(
-    task: str, kind: str, path: str | Path | None = None, **settings: Any
-) -> DiscriminatorSampler | CVAESampler:
+def load_sampler(task: str, kind: str, path: str | Path | None = None, **settings: Any) -> Any:
     """Load a sampler's weights.
 
     Args:
         task: "snake" or "fetch".
-        kind: "discriminator" or "cvae".
+        kind: "discriminator", "cvae" or "global-cvae".
         path: a folder that ``nrp train`` wrote, or the ``model.npz`` in it; the packaged weights
             if None.
-        settings: fields of :class:`DiscriminatorSampler` or :class:`CVAESampler`.
+        settings: fields of the sampler's class, such as ``num_edge_checked``.
+
+    Returns:
+        A :class:`DiscriminatorSampler`, :class:`CVAESampler` or :class:`GlobalCVAESampler`.
 
     Raises:
         ValueError: there is no such model, or it is for another task or of another kind.
@@ -254,16 +226,22 @@ def check_fits(sampler: Any, robot: MobileRobot, world: GridWorld, kind: str) ->
     """Check that a sampler of this module suits a robot and a map.
 
     Args:
-        sampler: any sampler; other classes are not checked.
+        sampler: any sampler; of other classes only the method that planners call is checked.
         robot: to plan for.
         world: the robot in a home.
-        kind: "discriminator" or "cvae", which the planner needs.
+        kind: "discriminator", "cvae" or "global-cvae", which the planner needs.
 
     Raises:
         ValueError: the sampler is of another task or kind, or the map's cells are others than those
-            that the networks were trained on.
+            that the networks were trained on, or more than a network of whole maps can see.
     """
-    if not isinstance(sampler, DiscriminatorSampler | CVAESampler):
+    if not isinstance(sampler, DiscriminatorSampler | Generator):
+        method = "draw" if kind == GLOBAL_CVAE else "propose"
+        if not hasattr(sampler, method):
+            raise ValueError(
+                f"the sampler, a {type(sampler).__name__}, has no method {method}; expected one as "
+                f"of load_sampler('{robot.name}', '{kind}')"
+            )
         return
     config = sampler.config
     if (config.task, config.kind) != (robot.name, kind):
@@ -272,12 +250,19 @@ def check_fits(sampler: Any, robot: MobileRobot, world: GridWorld, kind: str) ->
             f"'{robot.name}': load_sampler('{robot.name}', '{kind}')"
         )
     cell = float(world.field.resolution)
-    layers = jax.eval_shape(features.surroundings, world.field).shape[2]
+    *sides, layers = jax.eval_shape(features.surroundings, world.field).shape
     expected = 1 if robot.planar else round(HEIGHT / RESOLUTION)
     if abs(cell - RESOLUTION) > 1e-6 or layers != expected:
         raise ValueError(
             f"the map has {layers} layers of cells of {cell:g} m; samplers have seen {expected} of "
             f"{RESOLUTION} m: see nrp_jax.homes.grid.coarsened and Grid.crop"
+        )
+    most = CELLS[config.task]
+    if config.scope == "map" and max(sides) > most:
+        raise ValueError(
+            f"the map has {sides[0]} x {sides[1]} cells; networks that see the whole map see "
+            f"{most} x {most} at most: crop it, or take a planner that sees windows, such as "
+            "nrp-connect"
         )
     bottom = float(world.near[0].bottom)
     if not robot.planar and abs(bottom) > RESOLUTION / 2:

@@ -27,7 +27,7 @@ NRP_ROOMS = (
     ("homes",),
     ("scene",),
     ("learning",),
-    ("samplers",),
+    ("samplers", "generators"),
     ("planners",),
     ("planner", "problems"),
     ("viz", "viewer"),

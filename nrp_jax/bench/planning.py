@@ -139,6 +139,7 @@ def add_arguments(subparsers: Any) -> None:
     )
     parser.add_argument("--discriminator", help="what nrp train wrote; packaged by default")
     parser.add_argument("--cvae", help="what nrp train wrote; packaged by default")
+    parser.add_argument("--global-cvae", help="what nrp train wrote; packaged by default")
     parser.add_argument(
         "--seed", type=command.whole(0, 100_000), default=0, help="of the homes, as for nrp data"
     )
@@ -162,7 +163,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
         method: load_sampler(
             robot.name,
             KINDS[method],
-            getattr(arguments, KINDS[method]),
+            getattr(arguments, KINDS[method].replace("-", "_")),
             **(UNCHECKED if method in CONNECT else {}),
         )
         for method in methods

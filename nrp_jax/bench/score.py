@@ -22,7 +22,7 @@ from nrp_jax.bench.maps import load_maps
 from nrp_jax.bench.optimality import make_queries, optimality
 from nrp_jax.homes.grid import Grid
 from nrp_jax.learning.data import load_dataset
-from nrp_jax.learning.models import KINDS, TASKS
+from nrp_jax.learning.models import TASKS, WAYPOINT_KINDS
 from nrp_jax.learning.roadmap import Roadmap, build_roadmap, load_roadmap
 from nrp_jax.learning.shards import VERSION, home_seed
 from nrp_jax.scene.robots import MobileRobot, load_robot
@@ -163,7 +163,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
     checked = {"num_edge_checked": 1} if arguments.unchecked else {}
     tested = {
         kind: samplers.load_sampler(task, kind, getattr(arguments, kind), **checked)
-        for kind in KINDS
+        for kind in WAYPOINT_KINDS
     }
     dataset = load_dataset(arguments.data, "test")
     if dataset.settings.task != task:
@@ -181,7 +181,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
     seeds = [home_seed(dataset.settings, "test", k) for k in range(len(dataset.grids))]
     figures = {
         "task": task,
-        "weights": {kind: getattr(arguments, kind) or "packaged" for kind in KINDS},
+        "weights": {kind: getattr(arguments, kind) or "packaged" for kind in WAYPOINT_KINDS},
         "networks": {kind: dataclasses.asdict(s.config) for kind, s in tested.items()},
         "checked": not arguments.unchecked,
         "nodes": arguments.nodes,

@@ -18,10 +18,14 @@ from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning import features, local_map
 from nrp_jax.learning.data import Dataset
 from nrp_jax.learning.expert import GOOD_RATIO
-from nrp_jax.learning.models import ModelConfig
+from nrp_jax.learning.models import GLOBAL_CVAE, ModelConfig
 from nrp_jax.scene.field import DistanceField, make_field
 from nrp_jax.scene.robots import MobileRobot, batch_link_features
 from vrrt_jax.core.types import pytree
+
+# Each query that is turned by itself is turned by all quarters, of which one is kept.
+LARGE_IMAGE = 100_000  # cells
+LIMITS = np.array([[4], [2]])  # of quarter turns, and of mirrors
 
 
 @pytree
@@ -113,17 +117,24 @@ def load_examples(
             is 1 for good waypoints and 0 for others.
 
     Raises:
-        ValueError: the data set is of another task.
+        ValueError: the data set is of another task, or of rows that such a model does not learn
+            from.
     """
     if dataset.settings.task != config.task:
         raise ValueError(
             f"the data set is of task '{dataset.settings.task}', the model of '{config.task}'; "
             "give another data set, or the other --task"
         )
+    if dataset.settings.paths != (config.kind == GLOBAL_CVAE):
+        holds, option = ("paths", "without") if dataset.settings.paths else ("waypoints", "with")
+        raise ValueError(
+            f"the data set holds {holds}, but a '{config.kind}' learns from other rows; give one "
+            f"that nrp data wrote {option} --paths, or another --model"
+        )
     rows = dataset.rows
     # Which rows, and how good their waypoints are.
     good = rows["ratio"] <= GOOD_RATIO
-    if config.kind == "cvae":
+    if config.kind != "discriminator":
         rows = {name: column[good] for name, column in rows.items()}
         target = weight = np.ones(good.sum())
     else:
@@ -204,16 +215,22 @@ def make_batch(
         robot: whose configurations they are.
         examples: training rows.
         chosen: (n,) indices of queries.
-        key: turns and mirrors each query at random, if given. Homes have no preferred direction,
-            so that a query stands for eight.
+        key: turns and mirrors each query at random, if given; queries with images of more than
+            ``LARGE_IMAGE`` cells all alike. Homes have no preferred direction, so that a query
+            stands for eight.
     """
     # Images, configurations and link frames in the local frames.
     image, q, points = jax.vmap(lambda index: _local(config, examples, index))(chosen)
     if key is not None:
         # One of the eight symmetries of a square for each query.
-        symmetry = jax.random.randint(key, (2, len(chosen)), 0, jnp.array([[4], [2]]))
-        quarter, mirror = symmetry[0], symmetry[1] == 1
-        image = jax.vmap(features.turn_image)(image, quarter, mirror)
+        alike = image[0].size > LARGE_IMAGE
+        symmetry = jax.random.randint(key, (2, 1 if alike else len(chosen)), 0, LIMITS)
+        symmetry = symmetry[0], symmetry[1] == 1
+        if alike:
+            image = jax.vmap(lambda one: features.turn_image(one, *(s[0] for s in symmetry)))(image)
+        else:
+            image = jax.vmap(features.turn_image)(image, *symmetry)
+        quarter, mirror = (jnp.broadcast_to(s, len(chosen)) for s in symmetry)
         q = jax.vmap(lambda *a: features.turn_configuration(robot, *a))(q, quarter, mirror)
         points = jax.vmap(features.turn_points)(points, quarter, mirror)
     described = describe(config, robot, q, points)

@@ -39,11 +39,16 @@ def build_module(config: ModelConfig, num_outputs: int) -> Discriminator | CVAE:
 
 
 def save_model(model: Model, path: str | Path) -> None:
-    """Write a model, in half precision; a killed process leaves the old file or the new one."""
+    """Write what planning needs of a model, in half precision: of a CVAE, all but its encoder.
+
+    A killed process leaves the old file or the new one.
+    """
     path = Path(path)
-    flat = flax.traverse_util.flatten_dict(jax.device_get(model.variables), sep="/")
+    flat = flax.traverse_util.flatten_dict(jax.device_get(model.variables))
     arrays: dict[str, Any] = {
-        f"variables/{name}": np.asarray(leaf, np.float16) for name, leaf in flat.items()
+        f"variables/{'/'.join(name)}": np.asarray(leaf, np.float16)
+        for name, leaf in flat.items()
+        if not name[1].startswith("encoder")
     }
     config = dataclasses.asdict(model.config)
     description = json.dumps({"version": VERSION, "config": config, "info": model.info})

@@ -180,11 +180,12 @@ def _open(out: Path, settings: DatasetSettings) -> dict[str, Any]:
         manifest = {"settings": dataclasses.asdict(settings), "rows": 0, "shards": {}}
         _write_manifest(out, manifest)
     manifest = _read_manifest(out)
+    there = dataclasses.asdict(DatasetSettings(**manifest["settings"]))
     for key, value in dataclasses.asdict(settings).items():
-        if manifest["settings"].get(key) != value:
+        if there[key] != value:
             raise ValueError(
-                f"the data set in '{out}' was made with {key} {manifest['settings'].get(key)}, not "
-                f"{value}; take another folder, or the same settings"
+                f"the data set in '{out}' was made with {key} {there[key]}, not {value}; take "
+                "another folder, or the same settings"
             )
     # Files that a killed run left.
     for path in out.glob(f"*{UNFINISHED}"):
@@ -249,6 +250,9 @@ def add_arguments(subparsers) -> None:
         "--seed", type=command.whole(0, 100_000), default=0, help="of homes, roadmaps and rows"
     )
     parser.add_argument(
+        "--paths", action="store_true", help="states along whole paths, for --model global-cvae"
+    )
+    parser.add_argument(
         "--jobs", type=command.whole(1, 1024), default=usable_cores(), help="processes"
     )
 
@@ -262,6 +266,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
         waypoints=arguments.waypoints,
         nodes=arguments.nodes,
         seed=arguments.seed,
+        paths=arguments.paths,
     )
     with tqdm(unit="home", disable=None) as bar:
 

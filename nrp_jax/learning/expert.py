@@ -39,6 +39,29 @@ class Rows:
     query: np.ndarray  # (n,) i32, rows of one query follow each other
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ShortestPaths:
+    """Shortest paths from all nodes of a roadmap to G of them."""
+
+    goals: np.ndarray  # (G,) nodes; each serves ``STARTS_PER_GOAL`` queries, one after the other
+    cost: np.ndarray  # (G, N) lengths
+    step: np.ndarray  # (G, N) next nodes, negative at the goals
+    critical: np.ndarray  # (N,) bool
+
+    def index_of(self, query: int) -> int:
+        """Which of the goals a query has."""
+        return query // STARTS_PER_GOAL
+
+
+def shortest_paths(rng: np.random.Generator, roadmap: Roadmap, num_queries: int) -> ShortestPaths:
+    """Draw the goals of some queries, and find the shortest paths to them."""
+    goals = rng.choice(len(roadmap.q), -(-num_queries // STARTS_PER_GOAL), replace=False)
+    cost, step = csgraph.dijkstra(roadmap.lengths, indices=goals, return_predecessors=True)
+    critical = np.zeros(len(roadmap.q), bool)
+    critical[np.argsort(-betweenness(cost, step))[:NUM_CRITICAL]] = True
+    return ShortestPaths(goals=goals, cost=cost, step=step, critical=critical)
+
+
 @single_precision
 def make_rows(
     world: GridWorld,
@@ -62,19 +85,16 @@ def make_rows(
         num_queries: starts with a goal each.
         num_waypoints: rows of a query, at most.
     """
-    # Shortest paths from all nodes to some goals: lengths (G, N), and each node's next node.
-    goals = rng.choice(len(roadmap.q), -(-num_queries // STARTS_PER_GOAL), replace=False)
-    cost, step = csgraph.dijkstra(roadmap.lengths, indices=goals, return_predecessors=True)
-    critical = np.zeros(len(roadmap.q), bool)
-    critical[np.argsort(-betweenness(cost, step))[:NUM_CRITICAL]] = True
+    paths = shortest_paths(rng, roadmap, num_queries)
+    goals, cost, step, critical = paths.goals, paths.cost, paths.step, paths.critical
     # Waypoints are nodes or, from index N on, samples that collide.
     num_nodes = len(roadmap.q)
     q = np.concatenate([roadmap.q, roadmap.colliding])
     extents = Extents(robot, q)
     rows = []
     for query in range(num_queries):
-        g = query // STARTS_PER_GOAL
-        start = _choose_start(rng, extents.inside(goals[g], slice(num_nodes)), critical, goals[g])
+        g = paths.index_of(query)
+        start = choose_start(rng, extents.inside(goals[g], slice(num_nodes)), critical, goals[g])
         window = extents.inside(start, slice(None))
         chosen = _choose_waypoints(
             rng, roadmap, start, cost[g], step[g, start], window, num_waypoints
@@ -104,7 +124,7 @@ def make_rows(
     )
 
 
-def _choose_start(
+def choose_start(
     rng: np.random.Generator, near_goal: np.ndarray, critical: np.ndarray, goal: int
 ) -> int:
     """Draw a start: sometimes near the goal, often a critical node.

@@ -10,7 +10,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-KINDS = ("discriminator", "cvae")
+GLOBAL_CVAE = "global-cvae"  # sees the whole map, and generates configurations along whole paths
+WAYPOINT_KINDS = ("discriminator", "cvae")
+KINDS = (*WAYPOINT_KINDS, GLOBAL_CVAE)
 TASKS = ("snake", "fetch")
 
 
@@ -19,7 +21,7 @@ class ModelConfig:
     """Architecture and inputs of a network; kept with its weights."""
 
     task: str  # "snake" or "fetch"
-    kind: str  # "discriminator" or "cvae"
+    kind: str  # "discriminator", "cvae" or "global-cvae"
     scope: str = "window"  # what the network sees: the local "window", or the whole "map"
     paper: bool = False  # the published architecture and its raw inputs
     patches: tuple[int, ...] = (4, 2)  # side of the patches each encoder layer merges
@@ -35,6 +37,7 @@ class ModelConfig:
     def default(cls, task: str, kind: str, scope: str = "window") -> "ModelConfig":
         """The light architecture: patches merged by matrix products, heights as channels."""
         check_choices(task, kind, scope)
+        scope = "map" if kind == GLOBAL_CVAE else scope
         wide = {"channels": (64, 96), "context": 192} if task == "fetch" else {}
         if scope == "map":
             wide["lookup"] = False
@@ -42,12 +45,15 @@ class ModelConfig:
             wide["channels"] = (32, 64, 96)
         if kind == "cvae":
             wide |= {"context": 384, "width": 384}
+        if kind == GLOBAL_CVAE:
+            wide |= {"context": 256, "width": 256}
         return cls(task=task, kind=kind, scope=scope, **wide)
 
     @classmethod
     def published(cls, task: str, kind: str, scope: str = "window") -> "ModelConfig":
         """The architecture of the paper, as its published code has it."""
         check_choices(task, kind, scope)
+        scope = "map" if kind == GLOBAL_CVAE else scope
         width = 512 if task == "snake" else 1024
         latent = 5 if task == "snake" else 8
         return cls(

@@ -80,7 +80,7 @@ def validate(
         for part in parts
     ]
     loss = float(np.mean([part[0] for part in found]))
-    if config.kind == "cvae":
+    if config.kind != "discriminator":
         return {"loss": loss, "quality": -float(np.mean([part[1] for part in found]))}
     logits, target, weight = (
         np.concatenate([part[i].ravel() for part in found]) for i in (1, 2, 3)

@@ -15,6 +15,7 @@ import numpy as np
 from nrp_jax.homes import houses
 from nrp_jax.learning.difficulty import fair_house
 from nrp_jax.learning.expert import make_rows
+from nrp_jax.learning.paths import make_path_rows
 from nrp_jax.learning.roadmap import build_roadmap
 from nrp_jax.scene.robots import load_robot
 from nrp_jax.scene.world import build_world
@@ -35,6 +36,7 @@ class DatasetSettings:
     waypoints: int = 8  # of a query
     nodes: int = 10_000  # of a home's roadmap
     seed: int = 0
+    paths: bool = False  # waypoints are states along whole paths, for a global CVAE
     homes_version: int = houses.VERSION
     rows_version: int = VERSION
 
@@ -67,7 +69,8 @@ def make_shard(settings: DatasetSettings, split: str, index: int, path: Path) ->
     world = build_world(robot, house.grid)
     roadmap = build_roadmap(world, robot, jax.random.key(seed), settings.nodes)
     rng = np.random.default_rng(seed)
-    rows = make_rows(world, robot, roadmap, rng, settings.queries, settings.waypoints)
+    make = make_path_rows if settings.paths else make_rows
+    rows = make(world, robot, roadmap, rng, settings.queries, settings.waypoints)
     with replacing(path) as file:
         np.savez_compressed(
             file,

@@ -20,6 +20,7 @@ from nrp_jax.learning.checkpoint import Model, build_module, save_model
 from nrp_jax.learning.data import fingerprint, load_dataset
 from nrp_jax.learning.models import ModelConfig
 from nrp_jax.learning.objective import init, loss_fn, validate
+from nrp_jax.learning.recipe import TrainConfig, check_settings, make_optimizer
 from nrp_jax.learning.training_io import (
     CheckpointStore,
     State,
@@ -33,20 +34,6 @@ from vrrt_jax.core import command
 from vrrt_jax.core.precision import single_precision
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TrainConfig:
-    """How a model is trained."""
-
-    epochs: int = 60
-    batch: int = 64  # queries a step
-    learning_rate: float = 2e-3  # at its peak, after which it falls to 0 along a cosine
-    weight_decay: float = 1e-3
-    patience: int = 12  # training ends after so many epochs without a better validation loss
-    augment: bool = True  # turn and mirror each query at random
-    validation: float = 0.15  # share of the homes that is held out
-    seed: int = 0
-
-
 @single_precision
 def train(
     config: ModelConfig,
@@ -54,7 +41,7 @@ def train(
     examples: Examples,
     out: str | Path,
     *,
-    settings: TrainConfig = TrainConfig(),
+    settings: TrainConfig | None = None,
     stamp: str = "",
     progress: bool = True,
 ) -> Model:
@@ -68,7 +55,7 @@ def train(
         examples: from :func:`nrp_jax.learning.batches.load_examples`.
         out: folder for ``model.npz`` (the best epoch), ``log.csv``, ``curves.png`` and
             ``checkpoint/`` (a recent epoch).
-        settings: of the training.
+        settings: of the training; the default ones if None.
         stamp: names the data; a training continues only on the same data.
         progress: show a progress bar.
 
@@ -81,7 +68,9 @@ def train(
         RuntimeError: the validation loss is not finite any more.
     """
     # The folder, and which homes are held out.
-    parts = {"model": dataclasses.asdict(config), "settings": dataclasses.asdict(settings)}
+    settings = TrainConfig() if settings is None else settings
+    recipe = {k: v for k, v in dataclasses.asdict(settings).items() if v is not None}
+    parts = {"model": dataclasses.asdict(config), "settings": recipe}
     training, validation = split_by_home(np.asarray(examples.home), settings)
     out = claim_output_dir(Path(out), {**parts, "data": stamp})
     # The network, the optimizer, and a random or restored state.
@@ -89,10 +78,7 @@ def train(
     module = build_module(config, sample.waypoints.shape[-1])
     size = min(settings.batch, len(training))
     steps = settings.epochs * (len(training) // size)
-    schedule = optax.warmup_cosine_decay_schedule(
-        0.0, settings.learning_rate, min(200, steps // 10 + 1), steps + 1
-    )
-    optimizer = optax.adamw(schedule, weight_decay=settings.weight_decay)
+    optimizer = make_optimizer(settings, steps)
     variables = init(config, module, sample, jax.random.key(settings.seed))
     state = State(
         variables=variables,
@@ -167,7 +153,7 @@ def _make_update(
     config: ModelConfig,
     robot: MobileRobot,
     module: Any,
-    optimizer: optax.GradientTransformation,
+    optimizer: optax.GradientTransformationExtraArgs,
     settings: TrainConfig,
 ) -> Callable[[State, Examples, jax.Array], tuple[State, jax.Array]]:
     """A compiled step of the optimizer on chosen queries (n,): the new state, and the loss ()."""
@@ -187,8 +173,9 @@ def _make_update(
         (loss, (_, changed)), gradient = jax.value_and_grad(objective, has_aux=True)(
             state.variables["params"]
         )
-        updates, moments = optimizer.update(gradient, state.optimizer, state.variables["params"])
-        params = optax.apply_updates(state.variables["params"], updates)
+        params = state.variables["params"]
+        updates, moments = optimizer.update(gradient, state.optimizer, params, value=loss)
+        params = optax.apply_updates(params, updates)
         variables = {**state.variables, **changed, "params": params}
         return State(variables=variables, optimizer=moments, step=state.step + 1), loss
 
@@ -222,29 +209,32 @@ def add_arguments(subparsers: Any) -> None:
     parser.set_defaults(run=_run_command)
     parser.add_argument("--task", required=True, choices=models.TASKS, help="whose sampler")
     parser.add_argument("--model", required=True, choices=models.KINDS, help="which sampler")
-    parser.add_argument("--paper", action="store_true", help="the published architecture")
+    parser.add_argument(
+        "--architecture",
+        choices=("light", "published"),
+        default="light",
+        help="published: the paper's networks, and its recipe where no option says otherwise",
+    )
     parser.add_argument(
         "--global", dest="whole_map", action="store_true", help="see the whole map, not a window"
     )
     parser.add_argument("--data", required=True, help="folder that nrp data wrote")
     parser.add_argument("--out", required=True, help="folder for the model, log and curves")
     parser.add_argument(
-        "--epochs", type=command.whole(1, 100_000), default=TrainConfig.epochs, help="at most"
+        "--epochs", type=command.whole(1, 100_000), help=f"at most; {TrainConfig.epochs}"
     )
     parser.add_argument(
-        "--batch", type=command.whole(1, 65_536), default=TrainConfig.batch, help="queries a step"
+        "--batch", type=command.whole(1, 65_536), help=f"queries a step; {TrainConfig.batch}"
     )
     parser.add_argument(
         "--learning-rate",
         type=command.real(1e-8, 1.0),
-        default=TrainConfig.learning_rate,
-        help="at its peak",
+        help=f"at its peak; {TrainConfig.learning_rate:g}",
     )
     parser.add_argument(
         "--patience",
         type=command.whole(1, 100_000),
-        default=TrainConfig.patience,
-        help="epochs without progress",
+        help=f"epochs without progress; {TrainConfig.patience}",
     )
     parser.add_argument("--hard", action="store_true", help="labels 0 and 1, none between")
     parser.add_argument(
@@ -253,19 +243,18 @@ def add_arguments(subparsers: Any) -> None:
 
 
 def _run_command(arguments: argparse.Namespace) -> int:
-    make = ModelConfig.published if arguments.paper else ModelConfig.default
-    config = make(arguments.task, arguments.model, "map" if arguments.whole_map else "window")
-    settings = TrainConfig(
-        epochs=arguments.epochs,
-        batch=arguments.batch,
-        learning_rate=arguments.learning_rate,
-        patience=arguments.patience,
-        seed=arguments.seed,
-    )
+    task, kind, published = arguments.task, arguments.model, arguments.architecture == "published"
+    make = ModelConfig.published if published else ModelConfig.default
+    config = make(task, kind, "map" if arguments.whole_map else "window")
+    settings = TrainConfig.published(task, kind) if published else TrainConfig()
+    named = ("epochs", "batch", "learning_rate", "patience", "seed")
+    given = {name: getattr(arguments, name) for name in named}
+    given = {name: value for name, value in given.items() if value is not None}
+    settings = dataclasses.replace(settings, **given)
     check_settings(settings)
-    robot = load_robot(arguments.task)
+    robot = load_robot(task)
     dataset = load_dataset(arguments.data)
-    soft = not arguments.hard
+    soft = not (arguments.hard or published)
     examples = load_examples(config, robot, dataset, soft=soft)
     stamp = f"{fingerprint(arguments.data)}, {len(dataset)} rows, soft {soft}"
     try:
@@ -276,17 +265,3 @@ def _run_command(arguments: argparse.Namespace) -> int:
     figures = ", ".join(f"{name} {value:.4g}" for name, value in model.info["best"].items())
     print(f"wrote {Path(arguments.out) / 'model.npz'}: {figures}")
     return 0
-
-
-def check_settings(settings: TrainConfig) -> None:
-    """Raise a ValueError that names the setting out of range."""
-    for name, low, high in (
-        ("epochs", 1, 100_000),
-        ("batch", 1, 65_536),
-        ("learning_rate", 1e-8, 1.0),
-        ("patience", 1, 100_000),
-        ("seed", 0, 2**31),
-    ):
-        value = getattr(settings, name)
-        if not low <= value <= high:
-            raise ValueError(f"{name} is {value}; expected {low} to {high}")

@@ -6,6 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax.config import EDGE_STEPS, PlannerConfig
+from nrp_jax.learning.models import GLOBAL_CVAE
+from nrp_jax.planners.cvae import CVAERRT, CVAEInformedRRTStar
 from nrp_jax.planners.nrp import NeuralRRT
 from nrp_jax.planners.nrp_connect import NRPConnect, packaged_sampler
 from nrp_jax.planners.nrp_star import NeuralRRTStar
@@ -16,13 +18,16 @@ from vrrt_jax.core.planners import RRT, BITStar, InformedRRTStar, RRTConnect, RR
 from vrrt_jax.core.types import ExpansionPolicy
 
 CONNECT = ("nrp-connect", "nrp-star-connect")
-# Those of the last row go on to improve their paths until the budget ends.
+# Those of the last two rows go on to improve their paths until the budget ends.
 PLANNERS = (
-    *("rrt", "rrt-is", "rrt-connect", "nrp-d", "nrp-g", "nrp-connect"),
-    *("rrt-star", "irrt-star", "bit-star", "nrp-star-d", "nrp-star-g", "nrp-star-connect"),
+    *("rrt", "rrt-is", "rrt-connect", "cvae-rrt", "nrp-d", "nrp-g", "nrp-connect"),
+    *("rrt-star", "irrt-star", "bit-star", "cvae-irrt-star"),
+    *("nrp-star-d", "nrp-star-g", "nrp-star-connect"),
 )
 # Of the samplers that planners need.
 KINDS = {
+    "cvae-rrt": GLOBAL_CVAE,
+    "cvae-irrt-star": GLOBAL_CVAE,
     "nrp-d": "discriminator",
     "nrp-g": "cvae",
     "nrp-star-d": "discriminator",
@@ -52,7 +57,7 @@ def policy_of(
         planner: one of :data:`PLANNERS`, or a policy.
         robot: to plan for.
         world: the robot in a home.
-        sampler: of the "nrp-" planners; the packaged one if None.
+        sampler: of the planners that have one; the packaged one if None.
         config: settings.
 
     Raises:
@@ -78,6 +83,12 @@ def policy_of(
             packaged_sampler(robot.name) if packaged else load_sampler(robot.name, KINDS[planner])
         )
     check_fits(sampler, robot, world, KINDS[planner])
+    if KINDS[planner] == GLOBAL_CVAE:
+        share = jnp.float32(config.uniform_share)
+        drawn = {"goal_bias": bias, "sampler": sampler, "uniform_share": share, **shape}
+        if planner == "cvae-rrt":
+            return CVAERRT(**drawn)
+        return CVAEInformedRRTStar(**drawn, **REWIRING)
     if planner in CONNECT:
         return NRPConnect(sampler=sampler, lanes=max(config.lanes, 2))
     rate = jnp.float32(config.straight_rate)

@@ -2,6 +2,8 @@
 
 import csv
 import dataclasses
+import itertools
+import json
 import os
 import signal
 import subprocess
@@ -10,15 +12,22 @@ import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from nrp_synthetic import synthetic_rows
+from nrp_synthetic import random_grid, synthetic_rows
 
+from nrp_jax.cli import main
+from nrp_jax.learning import features
 from nrp_jax.learning import train as training
 from nrp_jax.learning.batches import load_examples, make_batch, make_examples
 from nrp_jax.learning.checkpoint import load_model
+from nrp_jax.learning.data import Dataset
 from nrp_jax.learning.models import ModelConfig
-from nrp_jax.learning.train import TrainConfig, check_settings, split_by_home, train
+from nrp_jax.learning.recipe import TrainConfig, check_settings, make_optimizer
+from nrp_jax.learning.shards import DatasetSettings
+from nrp_jax.learning.train import split_by_home, train
+from nrp_jax.scene.robots import load_robot
 
 SETTINGS = TrainConfig(epochs=16, batch=48, patience=16)
 SMALL = {"channels": (16, 32), "context": 64, "width": 32}  # networks that train in seconds
@@ -53,6 +62,31 @@ def test_rows_of_a_query_stay_together(rows):
         same = (columns["q_start"] == np.asarray(examples.q[k, 0])).all(1) & good
         kept = np.asarray(examples.q[k, 2:])[np.asarray(examples.weight[k]) > 0]
         np.testing.assert_array_equal(kept, columns["waypoint"][same])
+
+
+@pytest.mark.light_compilation
+def test_large_maps_are_turned_all_alike():
+    """With what stands in them, by the same one of eight symmetries."""
+    robot, grid = load_robot("fetch"), random_grid(0, size=60, height=20)
+    config = ModelConfig.default("fetch", "global-cvae")
+    q = np.random.default_rng(0).uniform(1.0, 5.0, (3, 11)).astype(np.float32)
+    rows = {"q_start": q, "q_goal": q, "waypoint": q, "home": np.zeros(3), "query": np.arange(3)}
+    examples = make_examples(config, robot, [grid], rows, target=np.ones(3), weight=np.ones(3))
+    compiled = jax.jit(make_batch, static_argnums=0)
+    plain = compiled(config, robot, examples, np.arange(3))
+    for seed in range(3):
+        turned = compiled(config, robot, examples, np.arange(3), jax.random.key(seed))
+        found = []
+        for quarter, mirror in itertools.product(range(4), (False, True)):
+            image = features.turn_image(plain.image[0], jnp.int32(quarter), jnp.bool_(mirror))
+            if np.array_equal(image, turned.image[0]):
+                found.append((quarter, mirror))
+        (quarter, mirror), sign = found[0], 1 - 2 * found[0][1]
+        assert len(found) == 1 and np.array_equal(turned.image[1], turned.image[0])
+        place = np.asarray(plain.start[:, :2]) * [1, sign]
+        for _ in range(quarter):
+            place = np.stack([-place[:, 1], place[:, 0]], axis=1)
+        np.testing.assert_allclose(turned.start[:, :2], place, atol=1e-5)
 
 
 def test_homes_are_held_out_whole():
@@ -127,6 +161,41 @@ def test_the_generator_learns(rows, tmp_path):
     batch = compiled(config, robot, examples, np.arange(len(examples.home)))
     spread = np.asarray(batch.waypoints)[np.asarray(batch.weight) > 0].var(axis=0).mean()
     assert -model.info["best"]["quality"] < 0.9 * spread
+
+
+@pytest.mark.light_compilation
+def test_the_published_recipe_trains_by_the_command(tmp_path, monkeypatch, rows):
+    """Its settings are those of the paper's code; options overrule them."""
+    columns = {**rows[2], "ratio": np.where(rows[2]["good"], 1.0, np.inf)}
+    dataset = Dataset(settings=DatasetSettings(task="snake"), grids=rows[1], rows=columns)
+    monkeypatch.setattr(training, "load_dataset", lambda _: dataset)
+    monkeypatch.setattr(training, "fingerprint", lambda _: "synthetic")
+    command = ["train", "--task", "snake", "--model", "discriminator", "--data", "none"]
+    command += ["--architecture", "published", "--epochs", "1", "--out", str(tmp_path)]
+    assert main(command) == 0
+    assert load_model(tmp_path).config == ModelConfig.published("snake", "discriminator")
+    settings = json.loads((tmp_path / "training.json").read_text())["settings"]
+    assert settings["epochs"] == 1 and settings["batch"] == 16 and settings["plateau"] == 5000
+    assert settings["learning_rate"] == 1e-3 and settings["weight_decay"] == 5e-4
+    assert not settings["augment"] and settings["patience"] == 50
+    model = load_model(tmp_path)
+    assert model.info["data"].endswith("soft False")
+    assert "batch_stats" in model.variables and model.info["best"]["quality"] > 0.5
+    assert TrainConfig.published("fetch", "cvae").epochs == 100
+    with pytest.raises(ValueError, match="unknown task 'panda'"):
+        TrainConfig.published("panda", "cvae")
+
+
+def test_the_rate_halves_on_a_plateau():
+    settings = dataclasses.replace(TrainConfig.published("snake", "cvae"), plateau=3)
+    optimizer = make_optimizer(settings, steps=100)
+    params = {"w": np.ones(1, np.float32)}
+    state, sizes = optimizer.init(params), []
+    for _ in range(8):
+        update, state = optimizer.update(params, state, params, value=1.0)
+        sizes.append(-np.asarray(jax.tree.leaves(update)[0]).item())
+    assert sizes[0] == pytest.approx(1e-3, rel=1e-3)
+    assert sizes[-1] == pytest.approx(sizes[0] / 4, rel=1e-2)
 
 
 def test_settings_and_data_of_another_task_are_refused():
