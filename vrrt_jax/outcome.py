@@ -15,7 +15,7 @@ from vrrt_jax.core.search import SearchResult
 from vrrt_jax.core.shortcut import padded
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.verify import check_path
-from vrrt_jax.scene.world import World, batch_clearance, keeping_clearance
+from vrrt_jax.scene.world import World, batch_clearance, keeping_clearance, obstacle_list
 
 Progress = Callable[..., Any] | None  # called with the search state and the seconds so far
 
@@ -112,6 +112,8 @@ def finish(
         loss=chosen.loss,
         match_threshold=chosen.threshold,
     )
+    if not obstacle_list(world):
+        return dataclasses.replace(result, tree_share=chosen.tree_share)
     # Every fourth of the small steps, and the end: what the spheres do between is next to nothing.
     seldom = np.concatenate([result.trajectory[::4], result.trajectory[-1:]])
     clearance = batch_clearance(world, padded(seldom, 512))
