@@ -17,7 +17,7 @@ VIEW = FIELDS["views"][0]
     [
         ({"goal_config": [0.0]}, "unknown fields: goal_config; known ones: robot, world"),
         ({"Start": [0.0]}, "unknown fields: Start"),
-        ({"views": [VIEW | {"mask": "mask.png"}]}, "view 0 .* unknown fields: mask; .* image"),
+        ({"views": [VIEW | {"masks": "mask.png"}]}, "view 0 .* unknown fields: masks; .* image"),
         ({"views": [VIEW | {"camera": VIEW["camera"] | {"roll": 3}}]}, "unknown fields: roll"),
         ({"views": []}, r"views of .* is \[\]"),
         ({"views": VIEW}, "expected a list of images and cameras"),

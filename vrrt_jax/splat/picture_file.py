@@ -32,7 +32,7 @@ def read_image(path: str | Path) -> np.ndarray:
                 )
             pixels = _decoded(ImageOps.exif_transpose(picture), path, picture.format == "PPM")
     except FileNotFoundError:
-        raise FileNotFoundError(f"no goal image at '{path}'; make one with: vrrt render") from None
+        raise FileNotFoundError(f"no picture at '{path}'; vrrt render makes goal images") from None
     except (
         UnidentifiedImageError,
         OSError,

@@ -77,7 +77,7 @@ def done(panda, arrays, tmp_path_factory):
 
 
 def _benchmark(panda, **changes):
-    return arm.ArmBenchmark(robot=panda, **changes)
+    return arm.ArmBenchmark(robot=panda, engine="closed_form", **changes)
 
 
 def test_results_tell_all_that_matters(done):

@@ -204,7 +204,8 @@ def test_a_random_goal_is_a_problem_of_the_folder(made, tmp_path, capsys):
         "image hardly tells: turn by 0.50"
     )
     for wrong, words in (
-        (["--camera", "c.json"], "has a camera of its own"),
+        (["--camera", "c.json"], "has a camera and a mask of its own; drop --camera"),
+        (["--box", "1,1,9,9"], "a mask of its own; drop --box"),
         (["--start", "9,9"], "start is outside the limits"),
         (["--start", "0.1"], "start has shape"),
         (["--world", "nowhere"], "no world at 'nowhere'"),
