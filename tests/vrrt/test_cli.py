@@ -33,11 +33,11 @@ def test_there_are_three_problems():
     assert len(PROBLEMS) >= 3
 
 
-def test_packaged_problems_are_solved(tmp_path):
+def test_packaged_problems_are_solved_and_without_time_they_are_not(tmp_path, capsys):
+    # The default engine, which compiles for longer, is what the README's example runs with.
+    fast = ["--engine", "closed_form"]
     for name in PROBLEMS:  # in one process: they share compiled programs
         out = tmp_path / name
-        # The default engine, which compiles for longer, is what the README's example runs with.
-        fast = ["--engine", "closed_form"]
         options = [*fast, "--trajectory", str(out / "trajectory.npz")]
         drawn = name == PROBLEMS[0]
         options += [] if drawn else ["--no-pictures"]
@@ -65,6 +65,11 @@ def test_packaged_problems_are_solved(tmp_path):
             animation.seek(animation.n_frames - 1)
             moved = np.abs(np.asarray(animation.convert("RGB"), float) - first).max(axis=2) > 40
             assert moved.mean() > 0.003
+    command = ["plan", "--problem", PROBLEMS[0], "--out", str(tmp_path), *fast, "--no-pictures"]
+    assert cli.main([*command, "--time-limit", "0"]) == 1
+    told = capsys.readouterr().err
+    assert "TIME_LIMIT" in told and "raise budget.time_limit_s" in told
+    assert json.loads((tmp_path / "result.json").read_text())["status"] == "TIME_LIMIT"
 
 
 def test_limits_of_motion_are_asked_for_before_the_plan(tmp_path, capsys):
@@ -81,14 +86,6 @@ def test_limits_of_motion_are_asked_for_before_the_plan(tmp_path, capsys):
     ):
         code, error = bad(capsys, *command, *options)
         assert code == 2 and told in error
-
-
-def test_without_a_solution_the_exit_code_is_one(tmp_path, capsys):
-    command = ["plan", "--problem", PROBLEMS[0], "--out", str(tmp_path), "--engine", "closed_form"]
-    assert cli.main([*command, "--time-limit", "0"]) == 1
-    told = capsys.readouterr().err
-    assert "TIME_LIMIT" in told and "raise budget.time_limit_s" in told
-    assert json.loads((tmp_path / "result.json").read_text())["status"] == "TIME_LIMIT"
 
 
 def test_a_process_ends_with_the_exit_code():
