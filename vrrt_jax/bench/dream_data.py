@@ -10,13 +10,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from vrrt_jax.checks import check_limits
 from vrrt_jax.core.data_file import read_json
 from vrrt_jax.core.opencv import load_opencv
 from vrrt_jax.core.results_file import fingerprint
+from vrrt_jax.robots.bodies import body_places
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.splat.camera import camera_from_matrix
 from vrrt_jax.splat.types import Camera
@@ -196,15 +196,6 @@ def solve_pose(
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = cv2.Rodrigues(turn)[0], move.ravel()
     return transform, error
-
-
-def body_places(robot: Robot, q: np.ndarray) -> dict[str, np.ndarray]:
-    """Origins (3,) in the world of all bodies by name, at a configuration (D,) [m]."""
-    model = mujoco.MjModel.from_xml_string(robot.xml)
-    data = mujoco.MjData(model)
-    data.qpos[:] = q
-    mujoco.mj_kinematics(model, data)
-    return {model.body(index).name: data.xpos[index].copy() for index in range(1, model.nbody)}
 
 
 def _own(name: Any, robot: Robot) -> str:

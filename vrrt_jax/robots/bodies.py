@@ -25,13 +25,23 @@ def moving_body(robot: Robot, name: str) -> tuple[int, np.ndarray]:
 
 def body_pose(robot: Robot, name: str, q: np.ndarray) -> np.ndarray:
     """Pose (4, 4) of a body in the world at ``q`` (D,)."""
-    model = _model(robot)
-    data = mujoco.MjData(model)
-    data.qpos[:] = q
-    mujoco.mj_kinematics(model, data)
+    data = _placed(robot, q)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = data.body(name).xmat.reshape(3, 3), data.body(name).xpos
     return pose
+
+
+def body_places(robot: Robot, q: np.ndarray) -> dict[str, np.ndarray]:
+    """Origins (3,) in the world of all bodies by name, at a configuration (D,) [m]."""
+    model, data = _model(robot), _placed(robot, q)
+    return {model.body(index).name: data.xpos[index].copy() for index in range(1, model.nbody)}
+
+
+def _placed(robot: Robot, q: np.ndarray) -> mujoco.MjData:
+    data = mujoco.MjData(_model(robot))
+    data.qpos[:] = q
+    mujoco.mj_kinematics(_model(robot), data)
+    return data
 
 
 @functools.lru_cache(maxsize=8)
