@@ -307,6 +307,7 @@ def _render(arguments: argparse.Namespace) -> int:
     from vrrt_jax import checks
     from vrrt_jax.core.data_file import read_fields
     from vrrt_jax.robots import load_robot
+    from vrrt_jax.robots.mesh_sources import needed_mesh_spec
     from vrrt_jax.splat.camera_fields import camera_from_dict
     from vrrt_jax.splat.mujoco_images import MeshRenderer
     from vrrt_jax.splat.picture_file import write_image
@@ -315,24 +316,12 @@ def _render(arguments: argparse.Namespace) -> int:
     width, height = arguments.size
     camera = camera_from_dict(read_fields(arguments.camera), (height, width))
     q = checks.check_limits(robot, np.array(arguments.q), "configuration")
-    picture = MeshRenderer(_meshes(robot)).picture(q, camera)
+    picture = MeshRenderer(needed_mesh_spec(robot)).picture(q, camera)
     if not picture.alpha.any():
         raise ValueError("the camera does not see the robot at this configuration; nothing written")
     write_image(arguments.out, picture.rgb, picture.alpha)
     print(f"wrote {arguments.out}")
     return EXIT_SOLVED
-
-
-def _meshes(robot):
-    from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
-
-    spec = mesh_spec(robot)
-    if spec is None:
-        raise ValueError(
-            f"the meshes of '{robot.name}' are not on this machine: "
-            f"{install_hint(robot.mesh_source)}"
-        )
-    return spec
 
 
 def _report(arguments: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ from vrrt_jax.checks import check_limits
 from vrrt_jax.core.edges import enforce_bounds
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.problems import Problem
-from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
+from vrrt_jax.robots.mesh_sources import needed_mesh_spec
 from vrrt_jax.robots.robot import Robot, workspace
 from vrrt_jax.scene.verify import contacts
 from vrrt_jax.scene.world import World, batch_is_free, obstacle_list
@@ -57,12 +57,7 @@ def random_problem(
     """
     if q_start is not None:
         q_start = check_limits(robot, q_start, "start")
-    spec = mesh_spec(robot)
-    if spec is None:
-        raise ValueError(
-            f"a goal image needs the meshes of '{robot.name}', which are not on this machine: "
-            f"{install_hint(robot.mesh_source)}"
-        )
+    spec = needed_mesh_spec(robot, "a goal image needs")
     pairs = free_pairs(robot, world, np.random.default_rng(seed), distance, q_start)
     q_start, q_goal = next(pairs, (None, None))
     if q_start is None or q_goal is None:

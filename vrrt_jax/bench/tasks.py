@@ -14,7 +14,7 @@ from vrrt_jax.bench.worlds import random_world
 from vrrt_jax.problems import load_world
 from vrrt_jax.random_problem import AZIMUTH_DEG, free_pairs, front_camera
 from vrrt_jax.robots import Robot, load_robot
-from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
+from vrrt_jax.robots.mesh_sources import needed_mesh_spec
 from vrrt_jax.scene.obstacles import Obstacle
 from vrrt_jax.scene.verify import verify_path
 from vrrt_jax.scene.world import (
@@ -210,12 +210,7 @@ def goal_images(
 @functools.lru_cache(maxsize=2)
 def _renderer(robot_name: str, hiding: tuple[Obstacle, ...], from_side: bool) -> MeshRenderer:
     robot = bench_robot(robot_name)
-    spec = mesh_spec(robot)
-    if spec is None:
-        raise ValueError(
-            f"goal images need the meshes of '{robot_name}', which are not on this machine: "
-            f"{install_hint(robot.mesh_source)}"
-        )
+    spec = needed_mesh_spec(robot, "goal images need")
     return MeshRenderer(spec, hiding, shines=SHINES if from_side else None)
 
 

@@ -36,6 +36,11 @@ class Chain:
         """L, with the fixed link 0."""
         return len(self.parents) + 1
 
+    @property
+    def is_hinge(self) -> np.ndarray:
+        """(D,) bool, which joints turn; the others slide. On the host."""
+        return ~np.any(np.asarray(self.slide), axis=(1, 2))
+
 
 @pytree
 class Spheres:

@@ -91,6 +91,27 @@ def frozen_joints(robot: "Robot") -> dict[str, float]:
     return {**(source.freeze if source else {}), **robot.frozen}
 
 
+def needed_mesh_spec(robot: "Robot", needing: str = "") -> mujoco.MjSpec:
+    """The same as :func:`mesh_spec`, where nothing can be done without it.
+
+    Args:
+        robot: from :func:`vrrt_jax.robots.load_robot`.
+        needing: what needs it, as "a goal image needs"; for the message.
+
+    Raises:
+        ValueError: it is nowhere on this machine, and what to install.
+    """
+    spec = mesh_spec(robot)
+    if spec is None:
+        what = (
+            f"{needing} the meshes of '{robot.name}', which"
+            if needing
+            else (f"the meshes of '{robot.name}'")
+        )
+        raise ValueError(f"{what} are not on this machine: {install_hint(robot.mesh_source)}")
+    return spec
+
+
 def mesh_spec(robot: "Robot", *, visuals: bool = True) -> mujoco.MjSpec | None:
     """The robot with its true geometry and the planned joints only.
 

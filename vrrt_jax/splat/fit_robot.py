@@ -19,7 +19,7 @@ from vrrt_jax.core.files import UNFINISHED, replacing
 from vrrt_jax.core.timing import versions
 from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.kinematics import body_links
-from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
+from vrrt_jax.robots.mesh_sources import needed_mesh_spec
 from vrrt_jax.robots.packaged import robot_names, robot_path
 from vrrt_jax.robots.robot import Robot, load_robot
 from vrrt_jax.robots.robot_folder import (
@@ -200,12 +200,7 @@ def _visible(robot: Robot) -> mujoco.MjSpec:
     Raises:
         ValueError: they are not on this machine, or nothing that moves is drawn.
     """
-    spec = mesh_spec(robot)
-    if spec is None:
-        raise ValueError(
-            f"the meshes of '{robot.name}' are not on this machine: "
-            f"{install_hint(robot.mesh_source)}"
-        )
+    spec = needed_mesh_spec(robot)
     model = spec.compile()
     is_drawn = np.isin(model.geom_group, VISUAL_GROUPS)
     links = set(np.asarray(body_links(model))[model.geom_bodyid[is_drawn]].tolist())

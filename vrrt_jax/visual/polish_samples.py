@@ -10,7 +10,7 @@ INNER_SPREAD = 0.05  # [rad] of joints that are not drawn anew
 
 def last_hinge(world: World) -> int:
     """The joint that turns the hand, behind which there may be sliding fingers."""
-    hinges = np.flatnonzero(_is_hinge(world))
+    hinges = np.flatnonzero(world.chain.is_hinge)
     return int(hinges[-1]) if len(hinges) else -1
 
 
@@ -21,11 +21,7 @@ def nearer_turns(world: World, q: np.ndarray, q_start: np.ndarray) -> np.ndarray
     """
     turned = q - 2 * np.pi * np.round((q - q_start) / (2 * np.pi))
     inside = (turned >= np.asarray(world.lower)) & (turned <= np.asarray(world.upper))
-    return np.where(inside & _is_hinge(world), turned, q)
-
-
-def _is_hinge(world: World) -> np.ndarray:
-    return ~np.any(np.asarray(world.chain.slide), axis=(1, 2))
+    return np.where(inside & world.chain.is_hinge, turned, q)
 
 
 def sample_around(

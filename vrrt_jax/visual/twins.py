@@ -28,7 +28,6 @@ class Flip:
 def find_flips(chain: Chain) -> list[Flip]:
     """The flips of an arm, each checked on random configurations."""
     joints = len(chain.parents)
-    is_hinge = ~np.any(np.asarray(chain.slide), axis=(1, 2))
     axes = _axes(chain)
     rng = np.random.default_rng(0)
     q = rng.uniform(-np.pi, np.pi, (16, joints)).astype(np.float32)
@@ -36,7 +35,7 @@ def find_flips(chain: Chain) -> list[Flip]:
     found = []
     for first in range(joints - 2):
         is_in_a_row = all(chain.parents[first + k] == first + k for k in (1, 2))
-        if not (is_in_a_row and is_hinge[first : first + 3].all()):
+        if not (is_in_a_row and chain.is_hinge[first : first + 3].all()):
             continue
         a, bend, b = axes[first : first + 3]
         if max(abs(a @ bend), abs(b @ bend)) > PERPENDICULAR:
