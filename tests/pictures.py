@@ -1,4 +1,4 @@
-"""Goal images that tests render with a self-model, and settings that plan to them quickly."""
+"""Goal images that tests render with a self-model."""
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +9,6 @@ import vrrt_jax
 Q_START = np.array([-0.9, 0.5, 0.0, -1.6, 0.0, 2.0, 0.8], np.float32)
 Q_GOAL = np.array([-0.5, 0.3, 0.2, -1.9, 0.1, 2.2, 0.6], np.float32)
 HALF_TURNED = Q_GOAL - np.pi * np.eye(7, dtype=np.float32)[6]
-# Of the default's shapes, and seen by a packaged problem's camera: most programs compile once for
-# all tests that plan.
-QUICK = vrrt_jax.PlannerConfig().changed(
-    {"lineages.samples": 512, "lineages.jumps": 16, "lineages.steps": 30, "lineages.young": 10}
-)
 
 
 def picture(panda, self_model, camera, q, level=2):

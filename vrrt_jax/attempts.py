@@ -23,8 +23,9 @@ from vrrt_jax.scene.world import World, batch_is_free
 from vrrt_jax.visual import lineages
 from vrrt_jax.visual import policy as published
 from vrrt_jax.visual.finish import finish_visual
+from vrrt_jax.visual.least_squares import linearize
 from vrrt_jax.visual.lineages import LineageRRT
-from vrrt_jax.visual.polish import compile_polishing, linearize
+from vrrt_jax.visual.polish import compile_polishing
 from vrrt_jax.visual.problem import VisualProblem
 
 ATTEMPT_KEY = 0x7FFFFFFF  # folded into the key of a later attempt; iterations count from 0
@@ -41,13 +42,16 @@ def plan_by_loss(
     config: PlannerConfig,
     on_progress: Progress,
 ) -> PlanResult:
-    """Attempts with different keys, until one is solved; the best of them."""
+    """Attempts with different keys, until one is solved; the best of them.
+
+    Most goals are found at once. So the first attempt is short, and each later one twice as long.
+    """
     with interruptible():
         result = attempt(robot, world, problem, policy, roots, key, config, on_progress)
         for again in range(1, config.budget.attempts):
             rest = time_left(config, result.timing["search_s"])
-            # A match in strange colors is believed, if the next attempt finds no better one.
-            goes_on = result.status in RETRYABLE or (again == 1 and _has_strange_colors(result))
+            # A match in strange colors is believed, if two more attempts find no better one.
+            goes_on = result.status in RETRYABLE or (again <= 2 and _has_strange_colors(result))
             if not goes_on or rest.budget.time_limit_s == 0:
                 break
             key = jax.random.fold_in(key, ATTEMPT_KEY - again)
@@ -57,6 +61,7 @@ def plan_by_loss(
                 room = config.tree.capacity - policy.lanes - len(roots)
                 others = free_around(world, policy, roots[0], key)[:room]
                 places = np.concatenate([roots, others])
+                policy = policy.with_effort(2)
             other = attempt(robot, world, problem, policy, places, key, rest, on_progress)
             if other.status in ABORTED and not other.ok:
                 # It ended before its loss could be compared with the other's.

@@ -27,10 +27,11 @@ class LineageConfig:
     num: int = setting(64, 0, 1024)  # lineages; 0 = the published planner instead (re-compiles)
     trees: int = setting(2, 1, 64)  # such trees grow at once, one a core, and become one tree
     radius: float = setting(2.8, 0.0)  # how far edges scatter from the start [rad]
-    samples: int = setting(1024, 1, 1 << 20)  # such edges
-    jumps: int = setting(64, 0, 1 << 20)  # random changes of each lineage's best node
-    steps: int = setting(60, 1, 100_000)  # Adam steps of a lineage
-    young: int = setting(25, 0, 100_000)  # of them that every lineage takes, then the best go on
+    # Of the first attempt; each later one does twice as much as the one before.
+    samples: int = setting(128, 1, 1 << 20)  # edges that scatter
+    jumps: int = setting(8, 0, 1 << 20)  # random changes of each lineage's best node
+    steps: int = setting(8, 1, 100_000)  # Adam steps of a lineage
+    young: int = setting(4, 0, 100_000)  # of them that every lineage takes, then the best go on
     alpha: float = setting(0.06, 0.0, 1.0)  # first of these steps, falling to zero [rad]
 
 
@@ -54,12 +55,12 @@ class PolishConfig:
     """Least squares after the search, which tells apart what the small images cannot."""
 
     hypotheses: int = setting(4, 0, 1024)  # distinct best nodes that are polished; 0 = none
-    samples: int = setting(256, 1, 65536)  # around them, in each round
+    samples: int = setting(256, 1, 65536)  # around them in each round, and as many drawn anew
     lanes: int = setting(32, 1, 1024)  # best samples, which descend
     kept: int = setting(8, 1, 1024)  # distinct ends that go on
-    rounds: int = setting(2, 1, 1024)  # of sampling and descending; twice as many without a match
-    spread: float = setting(0.8, 0.0)  # of a joint in the first round, half of that next [rad]
-    steps: int = setting(4, 0, 1024)  # Levenberg-Marquardt, in each round and at the end
+    rounds: int = setting(4, 1, 1024)  # of sampling and descending, until there is a match
+    spread: float = setting(0.8, 0.0)  # of a joint, half of that in the second round [rad]
+    steps: int = setting(4, 0, 1024)  # Levenberg-Marquardt, in each round
     coarse_px: int = setting(64, 8, 4096)  # image height in these rounds (re-compiles)
     px: int = setting(128, 8, 4096)  # image height at the end (re-compiles)
     close_px: int = setting(480, 0, 4096)  # image height that a close-up is cut from; 0 = none
@@ -87,7 +88,7 @@ class Budget:
     patience: int | None = setting(None, 1, optional=True)
     min_improvement: float = setting(0.0, 0.0)  # an improvement is a loss this much smaller ...
     min_ratio: float = setting(0.97, 0.0, 1.0)  # ... and below this share of the one before
-    attempts: int = setting(3, 1, 1024)  # the later ones with other keys, without a verified path
+    attempts: int = setting(4, 1, 1024)  # the later ones with other keys, without a verified path
     # Of all searches, compilation excluded [s].
     time_limit_s: float = setting(float("inf"), 0.0, endless=True)
     connect_iterations: int = setting(400, 1)  # of RRT-Connect, to a match

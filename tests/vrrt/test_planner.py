@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pictures import Q_GOAL, Q_START, QUICK, picture
+from pictures import Q_GOAL, Q_START, picture
 
 import vrrt_jax
 from vrrt_jax import ImageGoal
@@ -29,7 +29,7 @@ def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
             ImageGoal(model, camera, image),
             q_start,
             key=jax.random.key(0),
-            config=QUICK.changed(changes or {}),
+            config=vrrt_jax.PlannerConfig().changed(changes or {}),
         )
 
     result = run()
@@ -64,7 +64,7 @@ def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
 
 
 def test_batch_equals_single_plans(panda, self_model, camera, image, open_world):
-    config = QUICK.changed(
+    config = vrrt_jax.PlannerConfig().changed(
         {
             "budget.max_iterations": 10,
             "budget.settle_iterations": 0,
@@ -97,7 +97,7 @@ def test_batch_equals_single_plans(panda, self_model, camera, image, open_world)
 
 
 def test_goals_are_visited_in_turn(panda, self_model, camera, image, open_world):
-    run = {"key": jax.random.key(0), "config": QUICK}
+    run = {"key": jax.random.key(0)}
     shown, home = ImageGoal(self_model, camera, image), vrrt_jax.ConfigurationGoal(q=Q_START)
     legs = vrrt_jax.plan_waypoints(panda, open_world, [shown, home], Q_START, **run)
     assert [leg.ok for leg in legs] == [True, True]
@@ -107,7 +107,7 @@ def test_goals_are_visited_in_turn(panda, self_model, camera, image, open_world)
     way = np.concatenate([Q_START[None], *(leg.path[1:] for leg in legs)])
     assert vrrt_jax.verify_path(panda, open_world, way).ok
     # The first leg that fails is the last; nothing is planned where one goal makes no sense.
-    short = QUICK.changed({"budget.time_limit_s": 1e-9})
+    short = vrrt_jax.PlannerConfig().changed({"budget.time_limit_s": 1e-9})
     legs = vrrt_jax.plan_waypoints(
         panda, open_world, [shown, home], Q_START, **run | {"config": short}
     )
@@ -119,7 +119,9 @@ def test_goals_are_visited_in_turn(panda, self_model, camera, image, open_world)
 
 
 def test_the_short_form_is_an_image_goal(panda, self_model, camera, image, open_world):
-    config = QUICK.changed({"budget.max_iterations": 3, "budget.attempts": 1, "polish.rounds": 1})
+    config = vrrt_jax.PlannerConfig().changed(
+        {"budget.max_iterations": 3, "budget.attempts": 1, "polish.rounds": 1}
+    )
     mask = np.ones(image.shape[:2], bool)
     mask[360:] = False
     run: dict = {"key": jax.random.key(3), "config": config}
@@ -141,7 +143,7 @@ def test_holes_in_the_image_are_planned_around(panda, self_model, camera, open_w
     holed = np.where(mask[..., None], image, 1.0)
     key = jax.random.key(2)
     result = vrrt_jax.plan(
-        panda, open_world, self_model, camera, holed, Q_START, key=key, config=QUICK, mask=mask
+        panda, open_world, self_model, camera, holed, Q_START, key=key, mask=mask
     )
     assert result.ok, str(result)
     assert np.abs(result.q_goal - Q_GOAL).max() < 0.05
@@ -150,8 +152,8 @@ def test_holes_in_the_image_are_planned_around(panda, self_model, camera, open_w
 def test_another_attempt_while_nothing_matches(
     panda, self_model, camera, image, open_world, monkeypatch
 ):
-    brief = {"lineages.samples": 32, "lineages.jumps": 0, "lineages.young": 0, "lineages.steps": 1}
-    config = QUICK.changed(brief | {"match.scale": 1e-6, "polish.hypotheses": 0})
+    brief = {"lineages.samples": 32, "lineages.jumps": 6, "lineages.young": 0, "lineages.steps": 1}
+    config = vrrt_jax.PlannerConfig().changed(brief | {"match.scale": 1e-6, "polish.hypotheses": 0})
     args = (panda, open_world, self_model, camera, image, Q_START)
     results, begun = [], []
     for attempts in (1, 3):
@@ -179,7 +181,7 @@ def test_another_attempt_while_nothing_matches(
 
 
 def test_a_guess_becomes_a_root(panda, self_model, camera, image, open_world):
-    config = QUICK.changed({"budget.max_iterations": 3, "polish.hypotheses": 0})
+    config = vrrt_jax.PlannerConfig().changed({"budget.max_iterations": 3, "polish.hypotheses": 0})
     args = (panda, open_world, self_model, camera, image, Q_START)
     told = vrrt_jax.plan(*args, key=jax.random.key(0), config=config, q_guess=Q_GOAL + 0.05)
     np.testing.assert_allclose(told.tree.q[1], Q_GOAL + 0.05, atol=1e-6)
@@ -230,9 +232,7 @@ class HandGoal(vrrt_jax.LeastSquaresGoal):
 
 def test_a_goal_of_ones_own(panda, open_world):
     place = vrrt_jax.link_poses(panda.chain, jnp.asarray(Q_GOAL))[-1, :3, 3]
-    result = vrrt_jax.plan(
-        panda, open_world, HandGoal(place=place), Q_START, key=jax.random.key(0), config=QUICK
-    )
+    result = vrrt_jax.plan(panda, open_world, HandGoal(place=place), Q_START, key=jax.random.key(0))
     assert result.ok, str(result)
     hand = vrrt_jax.link_poses(panda.chain, jnp.asarray(result.path[-1]))[-1, :3, 3]
     assert float(jnp.linalg.norm(hand - place)) < 4e-3
@@ -298,7 +298,7 @@ def test_a_path_that_does_not_begin_at_the_start_is_told(panda, open_world):
 def test_the_score_of_a_planner_is_not_believed_as_a_loss(panda, open_world):
     place = vrrt_jax.link_poses(panda.chain, jnp.asarray(Q_GOAL))[-1, :3, 3]
     goal = HandGoal(place=place)
-    config = QUICK.changed(
+    config = vrrt_jax.PlannerConfig().changed(
         {"polish.hypotheses": 0, "budget.max_iterations": 2, "budget.attempts": 1}
     )
     result = vrrt_jax.plan(

@@ -19,9 +19,10 @@ from vrrt_jax.scene.world import World, checked_more_finely, with_margin
 from vrrt_jax.visual.certainty import match_probability
 from vrrt_jax.visual.distinct import distances_to, distinct
 from vrrt_jax.visual.join import Way, connect, join
+from vrrt_jax.visual.least_squares import evaluate, linearize, settle
 from vrrt_jax.visual.lineages import LineageRRT
 from vrrt_jax.visual.policy import VisualRRT
-from vrrt_jax.visual.polish import Polished, evaluate_cost, linearize, polish
+from vrrt_jax.visual.polish import Polished, polish
 from vrrt_jax.visual.problem import VisualProblem
 
 MAX_GOALS = 3  # matched configurations that are tried before there is no path
@@ -163,7 +164,7 @@ def _choose_ends(
         nodes = _best_nodes(world, score, q, q_start, config.polish.hypotheses, np.inf)
         seed = int(jax.random.bits(key, dtype=jnp.uint32))
         polished, compile_s, polish_s = timed(
-            lambda: polish(world, polishing, q[nodes], seed), evaluate_cost, linearize
+            lambda: polish(world, polishing, q[nodes], seed), evaluate, linearize, settle
         )
         found = dataclasses.replace(
             found, compile_s=found.compile_s + compile_s, search_s=found.search_s + polish_s

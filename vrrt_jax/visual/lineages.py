@@ -86,6 +86,11 @@ class LineageRRT:
             edge_steps=num_checks(world, cls.MAX_STEP),
         )
 
+    def with_effort(self, factor: int) -> "LineageRRT":
+        """The same policy, with so many times as much to do in each stage."""
+        names = ("samples", "jumps", "steps", "young")
+        return dataclasses.replace(self, **{n: factor * getattr(self, n) for n in names})
+
     @property
     def stages(self) -> Any:
         """Iterations (3,) at which the stages end; in the last all have had their steps."""

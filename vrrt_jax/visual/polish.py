@@ -2,17 +2,16 @@
 
 Many configurations look nearly like the goal: half a turn of a gripper, another elbow, a wrist that
 makes up for another. Each is a local minimum of the loss, which gradients do not leave. So samples
-spread widely around the best nodes of a search, with some joints moved and others not, and all
-descend by Levenberg-Marquardt, for which with few joints forward renders suffice. The distinct ends
-start the next round. Where none matches, the outer joints are drawn anew: the image tells them
-last. The last ends descend on a larger image with more splats, which tells what the small one does
-not, and then on a close-up of the hand beside it, where half a turn becomes visible. What no image
-tells stays near the start: a weak prior sees to that.
+spread widely around the best nodes of a search: some joints move a little, or the outer joints,
+which the image tells last, are drawn anew. The best descend by Levenberg-Marquardt. Where none
+matches, the distinct ends start the next round. Then the best settle on a larger image with more
+splats, which tells what the small one does not, and at last on a close-up of the hand beside it,
+where half a turn becomes visible. What no image tells stays near the start: a weak prior sees to
+that.
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,51 +19,40 @@ import numpy as np
 
 from vrrt_jax.config import PolishConfig
 from vrrt_jax.core.compiling import host_jit
-from vrrt_jax.core.edges import difference, enforce_bounds, steps_between
-from vrrt_jax.core.parallel import map_on_threads
-from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.scene.world import World
 from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.images import cut_goal
-from vrrt_jax.splat.lanes import map_lanes
 from vrrt_jax.splat.types import Camera, SplatModel
 from vrrt_jax.visual.distinct import distinct
 from vrrt_jax.visual.goal import CloseUp
+from vrrt_jax.visual.least_squares import (
+    Ends,
+    Objective,
+    Parabola,
+    derivatives,
+    descend,
+    evaluate_each,
+    settle_each,
+)
 from vrrt_jax.visual.polish_samples import last_hinge, nearer_turns, redraw_outer, sample_around
 from vrrt_jax.visual.twins import twins
 
-LINEARIZE_BATCH = 4  # configurations in one call: with their differences, a batch of renders
-CLOSE_UP_BATCH = 2  # the same at a close-up: few ends are left, and each core takes some
-EVALUATE_BATCH = 32  # configurations whose cost alone is asked for, in one call
-FD_STEP = 2e-4  # [rad] step of the finite differences; longer ones lose the weak directions
 LEAST_TOLD = 1e-3  # of a threshold per rad^2; joints that raise the loss by less are not told
-RIDGE = 1e-7  # keeps joints that no pixel sees where they are
-MAX_STEP = 0.3  # [rad] of one step of a joint
-LATE_SAMPLES = 4  # times as many, where nothing matches
+SETTLE_STEPS = 8  # at most, on the large images
+PROMISING = 6.0  # times the least cost; ends that cost more, and do not match, are left
 TWINNED = 2  # best ends whose kinematic twins are looked at
-PAYS = 0.01  # share of the cost; steps that save less are idle
-IDLE_STEPS = 2  # in a row, after which a configuration is left
 TURNS = 12  # in which the last joint goes all the way round
-SPREAD_DECAY = 0.5  # how far samples spread in a round, in units of the round before
+SECOND_SPREAD = 0.5  # how far samples spread in the second round, in units of the others
 LEAST_COVERED = 0.01  # share of a close-up; a hand that is hidden tells nothing
-
-
-@pytree
-class PriorGoal:
-    """A goal, and a weak preference for configurations near the start."""
-
-    goal: Any  # a LeastSquaresGoal
-    q_start: jax.Array  # (D,)
-    prior: jax.Array  # () cost of a radian away from the start
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Polishing:
     """On which images configurations are polished, and how."""
 
-    coarse: PriorGoal  # samples descend on this one
-    fine: PriorGoal  # and the last of them on this one
+    coarse: Objective  # samples descend on this one
+    fine: Objective  # and the last of them on this one
     close_up: CloseUp | None  # and their hands at last here
     config: PolishConfig
 
@@ -78,21 +66,6 @@ class Polishing:
     def threshold(self) -> float:
         """Loss of a match on the fine image."""
         return float(self.fine.goal.threshold)
-
-
-class _GaussNewtonModel(NamedTuple):
-    """The cost of n configurations, and its quadratic model around each."""
-
-    q: np.ndarray  # (n, D)
-    loss: np.ndarray  # (n,) of the goal alone
-    cost: np.ndarray  # (n,) and with the prior
-    matrix: np.ndarray  # (n, D, D) of Gauss and Newton, half of the cost's second derivatives
-    slope: np.ndarray  # (n, D) half of its first
-    free: np.ndarray  # (n,) bool
-
-    def take(self, rows: Any) -> "_GaussNewtonModel":
-        """The same of some configurations."""
-        return _GaussNewtonModel(*(column[rows] for column in self))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,75 +88,83 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
         q: (H, D) hypotheses.
         seed: of the samples.
     """
-    rng = np.random.default_rng(seed)
     config, coarse, fine = polishing.config, polishing.coarse, polishing.fine
-    q_start = np.asarray(fine.q_start)
-
-    # Rounds on the coarse image: sample, keep the best, descend, keep distinct ends. Where nothing
-    # matches after all rounds, there are as many again, with more samples.
-    for k in range(2 * config.rounds):
-        if k < config.rounds:
-            num, lanes, spread = config.samples, config.lanes, config.spread * SPREAD_DECAY**k
-            samples = sample_around(q, last_hinge(world), num, spread, rng)
-        else:
-            num, lanes = LATE_SAMPLES * config.samples // 2, 2 * config.lanes
-            around = sample_around(q, last_hinge(world), num, config.spread, rng)
-            samples = np.concatenate([around, redraw_outer(world, q, num, rng)])
-        samples = nearer_turns(world, samples, q_start)
-        cost = _in_batches(evaluate_cost, world, coarse, samples, EVALUATE_BATCH)[0]
-        best = samples[np.argsort(cost, kind="stable")[:lanes]]
-        ends = _descend(lambda q, _: _linearize(world, coarse, q), best, config.steps)
-        kept = _distinct_ends(world, ends, config.kept)
-        q = kept.q
-        matched = np.any(kept.free & (kept.cost <= float(coarse.goal.threshold)))
-        if matched and k + 1 >= config.rounds:
-            break
+    ends = _search_around(world, polishing, q, np.random.default_rng(seed))
 
     # The fine image, from every minimum over a whole turn of the last joint.
+    q = _promising(ends, coarse).q
     turned = _turns_of_last_hinge(world, fine, q, config.kept)
-    ends = _descend(lambda q, _: _linearize(world, fine, q), turned, config.steps)
-    kept = _with_twins(world, fine, _distinct_ends(world, ends, config.kept), config)
+    ends = _distinct_ends(world, _settled(world, fine, turned), config.kept)
+    others = nearer_turns(world, twins(world, ends.q[:TWINNED]), np.asarray(fine.prior.q))
+    if len(others):
+        found = _settled(world, fine, others)
+        both = Ends(*(np.concatenate(columns) for columns in zip(ends, found, strict=True)))
+        ends = _distinct_ends(world, both, config.kept)
+
+    # Once more, where derivatives are those of the minimum.
+    ends = _settled(world, fine, _promising(ends, fine).q)
+    ends = _distinct_ends(world, ends, config.kept)
 
     # The close-up of the hand, together with the fine image.
     if polishing.close_up is not None:
-        ends = _descend_close_up(world, polishing, polishing.close_up, kept)
-        kept = _distinct_ends(world, ends, config.kept)
-    colored = _linearize(world, fine, kept.q).loss
+        ends = _distinct_ends(
+            world, _settled_close_up(world, polishing, polishing.close_up, ends), config.kept
+        )
+    colored = evaluate_each(world, fine, ends.q)[0]
     judge = getattr(fine.goal, "judge", None)
     loss = colored
     if judge is not None:
-        loss = _linearize(world, dataclasses.replace(fine, goal=judge), kept.q).loss
-    informed = kept.matrix - float(fine.prior) * np.eye(q.shape[1])
+        loss = evaluate_each(world, dataclasses.replace(fine, goal=judge), ends.q)[0]
+    informed = ends.matrix - np.asarray(fine.prior.matrix)
     return Polished(
-        q=kept.q,
+        q=ends.q,
         loss=loss,
         colored_loss=colored,
-        cost=np.where(kept.free, kept.cost, np.inf),
+        cost=np.where(ends.free, ends.cost, np.inf),
         uncertainty=joint_uncertainty(informed, polishing.threshold),
     )
 
 
 def compile_polishing(world: World, polishing: Polishing) -> None:
     """Run every program of :func:`polish` once, at the start."""
-    q = np.asarray(polishing.fine.q_start)[None]
-    for goal in (polishing.coarse, polishing.fine):
-        _in_batches(evaluate_cost, world, goal, q, EVALUATE_BATCH)
-        _linearize(world, goal, q)
+    coarse, fine = polishing.coarse, polishing.fine
+    q = np.asarray(fine.prior.q)[None]
+    derivatives(world, coarse, q)
+    for goal in (coarse, fine):
+        evaluate_each(world, goal, q)
+    settle_each(world, [fine], q, 0)
     if polishing.close_up is not None:
-        near = _hand_goal(world, polishing.fine, polishing.close_up, q[0])[0]
-        _linearize(world, near, q, CLOSE_UP_BATCH)
+        near = _hand_goal(world, fine, polishing.close_up, q[0])[0]
+        settle_each(world, [near], q, 0)
 
 
-def _with_twins(
-    world: World, goal: PriorGoal, ends: _GaussNewtonModel, config: PolishConfig
-) -> _GaussNewtonModel:
-    """The best of the ends and of the kinematic twins of the few best."""
-    others = nearer_turns(world, twins(world, ends.q[:TWINNED]), np.asarray(goal.q_start))
-    if not len(others):
-        return ends
-    found = _descend(lambda q, _: _linearize(world, goal, q), others, config.steps)
-    both = [np.concatenate(columns) for columns in zip(ends, found, strict=True)]
-    return _distinct_ends(world, _GaussNewtonModel(*both), config.kept)
+def _search_around(
+    world: World, polishing: Polishing, q: np.ndarray, rng: np.random.Generator
+) -> Ends:
+    """Rounds on the coarse image, until one matches: sample, descend, keep distinct ends."""
+    config, coarse = polishing.config, polishing.coarse
+    for k in range(config.rounds):
+        spread = config.spread * (SECOND_SPREAD if k == 1 else 1.0)
+        around = sample_around(q, last_hinge(world), config.samples, spread, rng)
+        samples = np.concatenate([around, redraw_outer(world, q, config.samples, rng)])
+        samples = nearer_turns(world, samples, np.asarray(coarse.prior.q))
+        cost = evaluate_each(world, coarse, samples)[1]
+        best = samples[np.argsort(cost, kind="stable")[: config.lanes]]
+        ends = _distinct_ends(world, descend(world, coarse, best, config.steps), config.kept)
+        if np.any(ends.free & (ends.cost <= float(coarse.goal.threshold))):
+            break
+        q = ends.q
+    return ends
+
+
+def _promising(ends: Ends, objective: Objective) -> Ends:
+    """Those that match, or that cost little more than the best."""
+    enough = max(PROMISING * ends.cost[0], float(objective.goal.threshold))
+    return ends.take(ends.cost <= enough)
+
+
+def _settled(world: World, objective: Objective, q: np.ndarray) -> Ends:
+    return settle_each(world, [objective] * len(q), q, SETTLE_STEPS)
 
 
 def joint_uncertainty(matrix: np.ndarray, threshold: float) -> np.ndarray:
@@ -204,13 +185,13 @@ def joint_uncertainty(matrix: np.ndarray, threshold: float) -> np.ndarray:
     return np.minimum(np.sqrt(threshold * np.einsum("nii->ni", inverse)), np.pi)
 
 
-def _distinct_ends(world: World, model: _GaussNewtonModel, num: int) -> _GaussNewtonModel:
+def _distinct_ends(world: World, ends: Ends, num: int) -> Ends:
     """At most num, the free ones first and by rising cost; of near ones only the first."""
-    rows = distinct(world, model.q, np.lexsort([model.cost, ~model.free]), num)
-    return model.take(rows)
+    rows = distinct(world, ends.q, np.lexsort([ends.cost, ~ends.free]), num)
+    return ends.take(rows)
 
 
-def _turns_of_last_hinge(world: World, goal: PriorGoal, q: np.ndarray, num: int) -> np.ndarray:
+def _turns_of_last_hinge(world: World, objective: Objective, q: np.ndarray, num: int) -> np.ndarray:
     """The best (at most num, D) of configurations (H, D) and their minima over the last joint.
 
     Its turn is what images tell least: a gripper spins about its axis and hardly changes.
@@ -218,8 +199,8 @@ def _turns_of_last_hinge(world: World, goal: PriorGoal, q: np.ndarray, num: int)
     joints = q.shape[1]
     turn = 2 * np.pi / TURNS * np.arange(TURNS)
     around = (q[:, None] + turn[:, None] * np.eye(joints)[last_hinge(world)]).reshape(-1, joints)
-    around = nearer_turns(world, around, np.asarray(goal.q_start))
-    cost = _in_batches(evaluate_cost, world, goal, around, EVALUATE_BATCH)[0].reshape(-1, TURNS)
+    around = nearer_turns(world, around, np.asarray(objective.prior.q))
+    cost = evaluate_each(world, objective, around)[1].reshape(-1, TURNS)
     # A turn is a minimum if both of its neighbors cost more; no turn at all is always one.
     is_minimum = (cost < np.roll(cost, 1, axis=1)) & (cost <= np.roll(cost, -1, axis=1))
     is_minimum[:, 0] = True
@@ -227,32 +208,24 @@ def _turns_of_last_hinge(world: World, goal: PriorGoal, q: np.ndarray, num: int)
     return around[order[: min(num, np.sum(is_minimum))]]
 
 
-def _descend_close_up(
-    world: World, polishing: Polishing, close_up: CloseUp, ends: _GaussNewtonModel
-) -> _GaussNewtonModel:
-    """Descend on the fine image and a close-up of the first end's hand together.
+def _settled_close_up(world: World, polishing: Polishing, close_up: CloseUp, ends: Ends) -> Ends:
+    """Settle on the fine image and a close-up of the first end's hand together, twice.
 
     The cost is the sum of both; the fine image's is taken for the parabola that it is around ends.
     """
     goal, threshold = _hand_goal(world, polishing.fine, close_up, ends.q[0])
-    weight = polishing.threshold / threshold
-
-    def linearize_both(q: np.ndarray, rows: np.ndarray) -> _GaussNewtonModel:
-        near, own = _linearize(world, goal, q, CLOSE_UP_BATCH), ends.take(rows)
-        step = steps_between(world, own.q, near.q)
-        bent = np.einsum("nij,nj->ni", own.matrix, step)
-        return near._replace(
-            cost=own.cost + np.sum(step * (bent + 2 * own.slope), axis=1) + weight * near.loss,
-            matrix=own.matrix + weight * near.matrix,
-            slope=own.slope + bent + weight * near.slope,
-        )
-
-    return _descend(linearize_both, ends.q, polishing.config.steps)
+    goal = dataclasses.replace(goal, weight=jnp.float32(polishing.threshold / threshold))
+    around = [
+        dataclasses.replace(goal, prior=Parabola(q=q, cost=cost, slope=slope, matrix=matrix))
+        for q, _, cost, slope, matrix, _ in zip(*ends, strict=True)
+    ]
+    settled = settle_each(world, around, ends.q, SETTLE_STEPS)
+    return settle_each(world, around, settled.q, SETTLE_STEPS)
 
 
 def _hand_goal(
-    world: World, fine: PriorGoal, close_up: CloseUp, q: np.ndarray
-) -> tuple[PriorGoal, float]:
+    world: World, fine: Objective, close_up: CloseUp, q: np.ndarray
+) -> tuple[Objective, float]:
     """A close-up of the hand that a configuration (D,) has, and the loss of a match there."""
     whole = close_up.objective
     middle = np.asarray(_hand_px(world, whole.splats, whole.cameras, q))
@@ -260,9 +233,9 @@ def _hand_goal(
     # The fewer of its pixels are known, the less it says.
     known = max(float(np.mean(image.valid)), 1e-6)
     covered = float(np.mean(image.valid * image.alpha)) / known
-    objective = dataclasses.replace(whole, image=image, cameras=cameras)
-    goal = dataclasses.replace(fine, goal=objective, prior=jnp.float32(0))
-    return goal, close_up.threshold * max(covered, LEAST_COVERED) / known
+    goal = dataclasses.replace(whole, image=image, cameras=cameras)
+    objective = dataclasses.replace(fine, goal=goal)
+    return objective, close_up.threshold * max(covered, LEAST_COVERED) / known
 
 
 @host_jit
@@ -272,86 +245,3 @@ def _hand_px(world: World, splats: SplatModel, cameras: Camera, q: jax.Array) ->
     middle = jnp.sum(last[:, None] * splats.mean, axis=0) / jnp.sum(last)
     pose = link_poses(world.chain, q)[splats.link[-1]]
     return jax.vmap(project, (0, None))(cameras, pose[:3, :3] @ middle + pose[:3, 3])[0]
-
-
-def _descend(
-    linearize: Callable[[np.ndarray, np.ndarray], _GaussNewtonModel], q: np.ndarray, steps: int
-) -> _GaussNewtonModel:
-    """Levenberg-Marquardt: steps that lower the cost; those that do not raise the damping.
-
-    A configuration whose steps hardly pay any more is left where it is.
-
-    Args:
-        linearize: the model around some of the configurations, given these and their indices.
-        q: (n, D) where from.
-        steps: at most so many.
-    """
-    now = linearize(q, np.arange(len(q)))
-    damping, idle = np.full(len(now.q), 1e-3), np.zeros(len(now.q), int)
-    for _ in range(steps):
-        rows = np.flatnonzero(idle < IDLE_STEPS)
-        if not len(rows):
-            break
-        # Solve the damped normal equations of every configuration that goes on.
-        old = now.take(rows)
-        diagonal = np.einsum("nii->ni", old.matrix)
-        ridge = damping[rows, None] * diagonal + RIDGE
-        matrix = old.matrix + ridge[:, :, None] * np.eye(now.q.shape[1])
-        change = -np.linalg.solve(matrix, old.slope[..., None])[..., 0]
-        tried = linearize(old.q + np.clip(change, -MAX_STEP, MAX_STEP), rows)
-        # Take what is better; elsewhere go on from where it was, with shorter steps.
-        better = tried.cost < old.cost
-        damping[rows] *= np.where(better, 0.3, 4.0)
-        idle[rows] = np.where(tried.cost < (1 - PAYS) * old.cost, 0, idle[rows] + 1)
-        for column, new in zip(now, tried, strict=True):
-            column[rows[better]] = new[better]
-    return now
-
-
-def _linearize(
-    world: World, goal: PriorGoal, q: np.ndarray, size: int = LINEARIZE_BATCH
-) -> _GaussNewtonModel:
-    """The quadratic model around configurations (n, D)."""
-    return _GaussNewtonModel(*_in_batches(linearize, world, goal, q, size))
-
-
-def _in_batches(
-    function: Callable, world: World, goal: PriorGoal, q: np.ndarray, size: int
-) -> list[np.ndarray]:
-    """Arrays (n, ...) about configurations (n, D), a few at a time: one program serves any n."""
-    batches = -(-len(q) // size)
-    padded = np.resize(q, (batches * size, q.shape[1])).astype(np.float32)
-    found = map_on_threads(lambda batch: function(world, goal, batch), np.split(padded, batches))
-    return [np.concatenate(column)[: len(q)] for column in zip(*found, strict=True)]
-
-
-@host_jit
-def evaluate_cost(world: World, goal: PriorGoal, q: jax.Array) -> tuple[jax.Array]:
-    """The cost alone (n,), see :class:`_GaussNewtonModel`."""
-    q = enforce_bounds(world, q)
-    loss = map_lanes(lambda q: goal.goal.loss(world, q), q)
-    away = difference(world, goal.q_start, q)
-    return (loss + goal.prior * jnp.sum(away**2, axis=1),)
-
-
-@host_jit
-def linearize(world: World, goal: PriorGoal, q: jax.Array) -> tuple[jax.Array, ...]:
-    """Columns of a :class:`_GaussNewtonModel`; derivatives are finite differences."""
-    joints = q.shape[1]
-    q = enforce_bounds(world, q)
-    # Predictions of every configuration, and of the same with each joint moved a little.
-    places = q[:, None] + FD_STEP * jnp.eye(joints + 1, joints, -1)
-    seen = map_lanes(lambda q: goal.goal.prediction(world, q), places.reshape(-1, joints))
-    seen = seen.reshape(len(q), joints + 1, -1)
-    residual = seen[:, 0] - goal.goal.target()
-    jacobian = (seen[:, 1:] - seen[:, :1]) / FD_STEP
-    away = difference(world, goal.q_start, q)
-    loss = jnp.sum(residual**2, axis=1)
-    return (
-        q,
-        loss,
-        loss + goal.prior * jnp.sum(away**2, axis=1),
-        jnp.einsum("nip,njp->nij", jacobian, jacobian) + goal.prior * jnp.eye(joints),
-        jnp.einsum("nip,np->ni", jacobian, residual) + goal.prior * away,
-        jax.vmap(world.is_free)(q),
-    )

@@ -12,7 +12,8 @@ from vrrt_jax.core.goal import LeastSquaresGoal
 from vrrt_jax.core.types import Goal
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.visual.goal import ImageGoal
-from vrrt_jax.visual.polish import Polishing, PriorGoal
+from vrrt_jax.visual.least_squares import Objective, Parabola
+from vrrt_jax.visual.polish import Polishing
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -68,6 +69,13 @@ def make_problem(
     return VisualProblem(goal=search_goal, polishing=polishing)
 
 
-def _with_prior(goal: Any, q_start: np.ndarray, config: PlannerConfig) -> PriorGoal:
-    prior = jnp.float32(config.polish.start_prior * float(goal.threshold))
-    return PriorGoal(goal=goal, q_start=jnp.asarray(q_start), prior=prior)
+def _with_prior(goal: Any, q_start: np.ndarray, config: PlannerConfig) -> Objective:
+    """A goal, and a weak preference for configurations near the start."""
+    joints, weight = len(q_start), config.polish.start_prior * float(goal.threshold)
+    prior = Parabola(
+        q=jnp.asarray(q_start),
+        cost=jnp.float32(0),
+        slope=jnp.zeros(joints),
+        matrix=weight * jnp.eye(joints),
+    )
+    return Objective(goal=goal, weight=jnp.float32(1), prior=prior)

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from photo_cases import before, clutter, dream_folder, overlap, taken
-from pictures import HALF_TURNED, Q_GOAL, QUICK, picture
+from pictures import HALF_TURNED, Q_GOAL, picture
 from PIL import Image
 
 import vrrt_jax
@@ -91,7 +91,7 @@ def test_frames_are_planned_to_and_gone_on_with(folder, tmp_path):
         folder=str(path),
         levels=(0.5,),
         engine="closed_form",
-        config=QUICK.changed({"budget.attempts": 1, "polish.close_px": 0}),
+        config=vrrt_jax.PlannerConfig().changed({"budget.attempts": 1, "polish.close_px": 0}),
     )
     results = dream.run(benchmark, file)
     good, bad = results["rows"]

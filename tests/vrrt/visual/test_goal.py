@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pictures import Q_GOAL, Q_START, QUICK, picture
+from pictures import Q_GOAL, Q_START, picture
 
 import vrrt_jax
 from vrrt_jax import ImageGoal, ImageObjective
@@ -59,7 +59,7 @@ def test_a_loss_of_ones_own_reaches_search_polishing_and_match(
     losses = []
     for objective in (ImageObjective, HalfLoss):
         goal = ImageGoal(self_model, camera, image, objective=objective)
-        problem = make_problem(panda, goal, Q_START, QUICK)
+        problem = make_problem(panda, goal, Q_START, vrrt_jax.PlannerConfig())
         polishing = problem.polishing
         assert polishing is not None and polishing.close_up is not None
         stages = (

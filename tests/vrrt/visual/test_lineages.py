@@ -14,7 +14,9 @@ from vrrt_jax.core.expand import expand
 from vrrt_jax.core.tree import UNREACHED, lineage
 from vrrt_jax.visual.lineages import LineageRRT
 
-CONFIG = vrrt_jax.PlannerConfig().changed({"lineages.samples": 128, "lineages.jumps": 4})
+CONFIG = vrrt_jax.PlannerConfig().changed(
+    {"lineages.steps": 60, "lineages.young": 25, "lineages.jumps": 4}
+)
 
 
 @vrrt_jax.pytree

@@ -8,13 +8,15 @@ from pictures import HALF_TURNED, Q_GOAL, Q_START, picture
 
 import vrrt_jax
 from vrrt_jax import ImageGoal, PlannerConfig, PolishConfig
-from vrrt_jax.visual.polish import (
+from vrrt_jax.visual.least_squares import (
     LINEARIZE_BATCH,
-    _hand_goal,
-    joint_uncertainty,
+    derivatives,
+    descend,
+    evaluate_each,
     linearize,
-    polish,
+    settle_each,
 )
+from vrrt_jax.visual.polish import _hand_goal, joint_uncertainty, polish
 from vrrt_jax.visual.polish_samples import nearer_turns, redraw_outer
 from vrrt_jax.visual.problem import make_problem
 
@@ -33,10 +35,26 @@ def test_steps_lead_where_the_gradient_does(panda, self_model, camera, image, op
     q = jnp.asarray(Q_GOAL + 0.03 * noise, jnp.float32)
     gradient = jax.jit(jax.vmap(jax.grad(lambda q: coarse.goal.loss(open_world, q))))(q)
     model = jax.device_get(linearize(open_world, coarse, q))
-    matrix, slope = model[3], model[4]
+    slope, matrix = model[3], model[4]
     step = np.linalg.solve(matrix, slope[..., None])[..., 0]
     exact = np.linalg.solve(matrix, 0.5 * np.asarray(gradient)[..., None])[..., 0]
     np.testing.assert_allclose(step, exact, atol=0.1 * np.abs(exact).max())
+
+
+def test_settling_ends_where_fresh_derivatives_at_each_step_do(
+    panda, self_model, camera, open_world
+):
+    """Near a minimum the first derivatives serve all steps; the cost falls as far."""
+    image = picture(panda, self_model, camera, Q_GOAL, level=2)
+    fine = polishing_of(panda, self_model, camera, image, PlannerConfig()).fine
+    q = Q_GOAL + 0.02 * np.random.default_rng(0).normal(size=(2, 7)).astype(np.float32)
+    before = derivatives(open_world, fine, q)
+    settled = settle_each(open_world, [fine, fine], q, 8)
+    exact = descend(open_world, fine, q, 8)
+    assert np.all(before.cost - settled.cost > 0.9 * (before.cost - exact.cost))
+    assert np.all(settled.cost < 0.6 * before.cost)
+    largest = np.abs(before.matrix).max()
+    np.testing.assert_allclose(settled.matrix, before.matrix, atol=2e-3 * largest)
 
 
 def test_polishing_turns_the_wrist_back(panda, self_model, camera, open_world):
@@ -60,8 +78,8 @@ def test_a_close_up_tells_half_a_turn(panda, self_model, camera, open_world):
     assert polishing.close_up is not None
     hand, threshold = _hand_goal(open_world, polishing.fine, polishing.close_up, Q_GOAL)
     assert hand.goal.image.rgb.shape[1:3] == (polishing.close_up.px,) * 2
-    q = np.resize(np.stack([Q_GOAL, HALF_TURNED]), (LINEARIZE_BATCH, 7))
-    losses = [np.asarray(linearize(open_world, at, q)[1]) for at in (polishing.fine, hand)]
+    q = np.stack([Q_GOAL, HALF_TURNED])
+    losses = [evaluate_each(open_world, at, q)[0] for at in (polishing.fine, hand)]
     fine, close = (loss[1] / loss[0] for loss in losses)
     assert close > fine > 1 and losses[1][0] < threshold
 
