@@ -58,10 +58,10 @@ def plan_by_loss(
             # Where the start is walled in, what its tree does not reach is looked at too.
             places = roots
             if isinstance(policy, LineageRRT):
+                policy = policy.again()
                 room = config.tree.capacity - policy.lanes - len(roots)
                 others = free_around(world, policy, roots[0], key)[:room]
                 places = np.concatenate([roots, others])
-                policy = policy.with_effort(2)
             other = attempt(robot, world, problem, policy, places, key, rest, on_progress)
             if other.status in ABORTED and not other.ok:
                 # It ended before its loss could be compared with the other's.

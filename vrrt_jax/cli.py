@@ -167,10 +167,10 @@ def _off_by(problem, result) -> str:
     """How far the target is from the true goal: joints that the image tells, then all others."""
     import numpy as np
 
-    from vrrt_jax.core.edges import joint_error
+    from vrrt_jax.scene.world import pose_error
     from vrrt_jax.visual.finish import UNTOLD
 
-    error = joint_error(problem.world, result.target, problem.true_goal)
+    error = pose_error(problem.world, result.target, problem.true_goal)
     uncertainty = result.joint_uncertainty
     is_told = np.full(len(error), True) if uncertainty is None else uncertainty <= UNTOLD
     names = np.array(problem.robot.joint_names)

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 
 from vrrt_jax.config import PlannerConfig
-from vrrt_jax.core.edges import joint_error
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.result import PlanResult
 from vrrt_jax.core.shortcut import path_length
 from vrrt_jax.core.timing import versions
 from vrrt_jax.core.tree_file import nodes_of, save_nodes
 from vrrt_jax.problems import Problem, save_problem
-from vrrt_jax.scene.world import World
+from vrrt_jax.scene.world import World, pose_error
 
 
 def summary(
@@ -31,7 +30,7 @@ def summary(
         "versions": versions(),
     }
     if problem.true_goal is not None:
-        error = joint_error(problem.world, result.target, problem.true_goal)
+        error = pose_error(problem.world, result.target, problem.true_goal)
         fields["error_rad"] = {"mean": float(error.mean()), "max": float(error.max())}
     return fields
 

@@ -22,7 +22,6 @@ from vrrt_jax.bench.dream_table import summarize
 from vrrt_jax.bench.tasks import bench_robot, bench_world, level_name
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.data_file import read_fields
-from vrrt_jax.core.edges import joint_error
 from vrrt_jax.core.interrupt import uninterrupted
 from vrrt_jax.core.results_file import fingerprint, plain, resume, write
 from vrrt_jax.core.timing import machine, versions
@@ -30,7 +29,7 @@ from vrrt_jax.core.workers import in_processes
 from vrrt_jax.problems import self_model_path
 from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.world import World, batch_is_free
+from vrrt_jax.scene.world import World, batch_is_free, pose_error
 from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.extrinsics import world_to_camera
 from vrrt_jax.splat.foreground import robot_before_background, robot_in_box
@@ -208,7 +207,7 @@ def _solve(
         robot, world, goal, start, key=jax.random.key(seed), config=benchmark.config
     )
     wall_s, times = time.perf_counter() - began, result.timing
-    error = joint_error(world, result.target, frame.q)
+    error = pose_error(world, result.target, frame.q)
     return {
         "error_rad": [round(float(value), 5) for value in error],
         "mean_error_rad": round(float(error.mean()), 5),

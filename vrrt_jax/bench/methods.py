@@ -23,13 +23,12 @@ from vrrt_jax.bench.tasks import (
     level_name,
 )
 from vrrt_jax.config import PlannerConfig
-from vrrt_jax.core.edges import joint_error
 from vrrt_jax.core.result import Status
 from vrrt_jax.core.shortcut import path_length
 from vrrt_jax.problems import self_model_path
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.verify import verify_path
-from vrrt_jax.scene.world import World
+from vrrt_jax.scene.world import World, pose_error
 from vrrt_jax.splat.model import SelfModel, load_self_model
 
 METHODS = ("vrrt", "dr-robot", "prof-robot", "dr-robot-rrt-star")
@@ -117,7 +116,7 @@ def solve(
         attempt = _baseline(inputs, robot_name, task, method, key, masks)
     wall_s = time.perf_counter() - started
 
-    error = joint_error(world, attempt.path[-1], task.q_goal)
+    error = pose_error(world, attempt.path[-1], task.q_goal)
     right = bool(error.mean() < SUCCESS_RAD)
     valid = not collisions or verify_path(robot, world, attempt.path).ok
     success = right and valid and (attempt.has_path or not collisions)

@@ -24,9 +24,9 @@ from vrrt_jax.bench.tasks import (
     robot_views,
 )
 from vrrt_jax.core.edges import joint_error
-from vrrt_jax.robots.kinematics import Chain
+from vrrt_jax.scene.world import World
 from vrrt_jax.splat.images import shrink_views
-from vrrt_jax.splat.loss import goal_loss, weighted, weighted_goal
+from vrrt_jax.splat.loss import weighted, weighted_goal
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import GoalImage
 from vrrt_jax.visual.goal import ImageGoal, ImageObjective
@@ -117,20 +117,19 @@ def looks_the_same(
     objective = goal.at(bench_robot(robot), image_px)
     found, _ = shrink_views(robot_views(robot, q, scenery, masks), image_px)
     at_found, at_truth = _losses(
-        bench_world(robot, task.world).chain, objective, found, jnp.asarray(task.q_goal)
+        bench_world(robot, task.world), objective, found, jnp.asarray(task.q_goal)
     )
     return bool(at_found <= at_truth)
 
 
 @jax.jit
 def _losses(
-    chain: Chain, objective: ImageObjective, found: GoalImage, q_true: jax.Array
+    world: World, objective: ImageObjective, found: GoalImage, q_true: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Image losses () of found images (V, h, w, ...), and of the self-model at the goal (D,)."""
-    goal, splats = objective.image, objective.splats
+    goal = objective.image
     at_found = jnp.sum((weighted(found.rgb, found.alpha, goal) - weighted_goal(goal)) ** 2)
-    at_truth = goal_loss(chain, splats, objective.cameras, goal, q_true, objective.windows)
-    return at_found, at_truth
+    return at_found, objective.loss(world, q_true)
 
 
 def draw(path: str | Path, level: float = 2.5, seed: int = 0) -> None:

@@ -9,12 +9,12 @@ import numpy as np
 
 from vrrt_jax.config import Budget, PlannerConfig
 from vrrt_jax.core.edge_checks import free_prefix
-from vrrt_jax.core.edges import joint_error
 from vrrt_jax.core.expand import expand
 from vrrt_jax.core.search import make_termination, search
 from vrrt_jax.core.timing import interleaved_ms
 from vrrt_jax.planner import plan
 from vrrt_jax.problems import Problem, load_problem, problem_names
+from vrrt_jax.scene.world import pose_error
 from vrrt_jax.visual.lineages import LineageRRT
 from vrrt_jax.visual.problem import make_problem
 
@@ -95,7 +95,7 @@ def _outcome(problem: Problem, seeds: int) -> dict:
         )
         error = np.nan
         if problem.true_goal is not None:
-            apart = joint_error(problem.world, result.q_goal, problem.true_goal)
+            apart = pose_error(problem.world, result.q_goal, problem.true_goal)
             error = float(apart.mean())
         rows.append((result.ok, result.timing["search_s"], error, result.cost, result.iterations))
     table = np.array(rows, float)

@@ -309,3 +309,13 @@ def move_obstacle(
     return with_obstacles(
         world, [dataclasses.replace(o, **changes) if o.name == name else o for o in obstacles]
     )
+
+
+def pose_error(world: World, q: np.ndarray, q_goal: np.ndarray) -> np.ndarray:
+    """Distance (D,) of each joint from a goal [rad] or [m]; on the host.
+
+    A whole turn of a joint is no error: the pose is the same, and no image tells it.
+    """
+    error = np.asarray(q, np.float64) - q_goal
+    turns = np.round(error / (2 * np.pi)) * world.chain.is_hinge
+    return np.abs(error - 2 * np.pi * turns)

@@ -7,8 +7,11 @@ side. Colors therefore count less than coverage, which no lamp changes: a little
 compared with each other, and next to nothing where it is judged whether a pose matches at all.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vrrt_jax.robots.kinematics import Chain, link_poses
 from vrrt_jax.splat.raster import render
@@ -72,33 +75,6 @@ def relit(
     return jnp.minimum(gain * rgb, alpha[..., None])
 
 
-def goal_loss(
-    chain: Chain,
-    splats: SplatModel,
-    cameras: Camera,
-    goal: GoalImage,
-    q: jax.Array,
-    windows: Windows | None = None,
-    color_weight: float | jax.Array = COLOR_WEIGHT,
-) -> jax.Array:
-    """Loss of a configuration: weighted squared errors of color and alpha, the mean over V views.
-
-    Args:
-        chain: the robot's kinematics.
-        splats: the robot's splats.
-        cameras: V cameras.
-        goal: V images.
-        q: (D,) the configuration [rad] or [m].
-        windows: to render with, if any.
-        color_weight: () of colors.
-
-    Returns:
-        ().
-    """
-    image = weighted_image(chain, splats, cameras, goal, q, windows, color_weight)
-    return jnp.sum((image - weighted_goal(goal, color_weight)) ** 2)
-
-
 def _render_views(
     chain: Chain, splats: SplatModel, cameras: Camera, q: jax.Array, windows: Windows | None
 ) -> list[tuple[jax.Array, jax.Array]]:
@@ -119,8 +95,17 @@ def weighted_image(
 ) -> jax.Array:
     """The image of a configuration, as a vector for least squares.
 
-    The squared distance between this vector and :func:`weighted_goal` is the :func:`goal_loss`.
-    Arguments are those of :func:`goal_loss`.
+    The squared distance between this vector and :func:`weighted_goal` is the loss: weighted squared
+    errors of color and alpha, the mean over V views.
+
+    Args:
+        chain: the robot's kinematics.
+        splats: the robot's splats.
+        cameras: V cameras.
+        goal: V images.
+        q: (D,) the configuration [rad] or [m].
+        windows: to render with, if any.
+        color_weight: () of colors.
 
     Returns:
         (V * H * W * 4,), see :func:`weighted`.
@@ -170,6 +155,33 @@ def _root_weight(goal: GoalImage, color_weight: float | jax.Array) -> jax.Array:
     channels = jnp.stack([color, color, color, jnp.ones_like(color)], axis=-1)
     pixel = goal.valid / (4.0 * len(goal.valid) * num_valid[:, None, None])
     return jnp.sqrt(pixel[..., None] * channels[:, None, None])
+
+
+def block_means(image: jax.Array, blocks: Sequence[int]) -> jax.Array:
+    """What is left of a weighted image if one looks at it through half-closed eyes.
+
+    Errors of pixels tell nothing about an arm that is elsewhere by more than its width. Means over
+    blocks do, and so lead from farther away. Neighboring blocks overlap by half.
+
+    Args:
+        image: (V * H * W * 4,) see :func:`weighted`, as (V, H, W, 4).
+        blocks: heights and widths of blocks [px], even numbers.
+
+    Returns:
+        A vector whose squared length is that of the image, where the image is smooth.
+    """
+    means = []
+    for block in blocks:
+        # Sums of half a block, of which two by two neighbors make a block.
+        half = block // 2
+        padded = jnp.pad(image, [(0, 0), *((0, -size % half) for size in image.shape[1:3]), (0, 0)])
+        views, rows, columns, channels = padded.shape
+        cells = padded.reshape(views, rows // half, half, columns // half, half, channels)
+        sums = jnp.pad(jnp.sum(cells, axis=(2, 4)), [(0, 0), (1, 1), (1, 1), (0, 0)])
+        sums = sums[:, 1:] + sums[:, :-1]
+        sums = sums[:, :, 1:] + sums[:, :, :-1]
+        means.append(sums.ravel() / (2 * block))  # every pixel is in four blocks
+    return jnp.concatenate(means) / np.sqrt(len(blocks))
 
 
 def psnr_db(mean_squared_error: float) -> float:

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.goal import LeastSquaresGoal
-from vrrt_jax.core.types import pytree
+from vrrt_jax.core.types import pytree, static
 from vrrt_jax.robots.kinematics import batch_link_poses
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.splat.images import View, check_views, shrink_views
 from vrrt_jax.splat.loss import (
     COLOR_WEIGHT,
     MATCH_COLOR_WEIGHT,
-    goal_loss,
+    block_means,
     weighted_goal,
     weighted_image,
 )
@@ -42,25 +42,30 @@ class ImageObjective(LeastSquaresGoal):
     image: GoalImage
     threshold: Any  # () loss of a match
     color_weight: Any = COLOR_WEIGHT  # () of colors beside coverage
+    blocks: tuple[int, ...] = static(default=())  # whose means are compared, instead of pixels [px]
 
     @property
     def judge(self) -> Self:
         """The same goal as it is judged: in other light than the self-model's a match stays one."""
         return dataclasses.replace(self, color_weight=jnp.float32(MATCH_COLOR_WEIGHT))
 
-    def loss(self, world: Any, q: jax.Array) -> jax.Array:
-        """Weighted squared errors () of the rendered configuration (D,), in the goal's light."""
-        views = self.cameras, self.image
-        return goal_loss(world.chain, self.splats, *views, q, self.windows, self.color_weight)
-
     def prediction(self, world: Any, q: jax.Array) -> jax.Array:
-        """The rendered configuration (D,) as a weighted vector (V * H * W * 4,)."""
+        """The rendered configuration (D,) as a weighted vector, in the goal's light.
+
+        (V * H * W * 4,), or shorter where blocks are compared.
+        """
         views = self.cameras, self.image
-        return weighted_image(world.chain, self.splats, *views, q, self.windows, self.color_weight)
+        seen = weighted_image(world.chain, self.splats, *views, q, self.windows, self.color_weight)
+        return self._in_blocks(seen)
 
     def target(self) -> jax.Array:
-        """The goal images as a weighted vector (V * H * W * 4,)."""
-        return weighted_goal(self.image, self.color_weight)
+        """The goal images as such a vector."""
+        return self._in_blocks(weighted_goal(self.image, self.color_weight))
+
+    def _in_blocks(self, seen: jax.Array) -> jax.Array:
+        if not self.blocks:
+            return seen
+        return block_means(seen.reshape(*self.image.alpha.shape, 4), self.blocks)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -106,13 +111,20 @@ class ImageGoal:
         cameras, images, masks = self.views
         return check_views(images, cameras, masks)
 
-    def at(self, robot: Robot, image_px: int, match_scale: float = 1.0) -> ImageObjective:
+    def at(
+        self,
+        robot: Robot,
+        image_px: int,
+        match_scale: float = 1.0,
+        blocks: tuple[int, ...] = (),
+    ) -> ImageObjective:
         """The goal on images of one height.
 
         Args:
             robot: whose goal it is.
             image_px: height that the images are shrunk to [px].
             match_scale: the threshold, in units of the self-model's calibrated one.
+            blocks: whose means are compared, instead of pixels [px].
 
         Raises:
             ValueError: an image, a camera or a mask makes no sense, or the masks leave nothing of
@@ -135,6 +147,7 @@ class ImageGoal:
             image=image,
             threshold=match_scale * level.match_threshold * covered,
             color_weight=jnp.float32(COLOR_WEIGHT),
+            blocks=blocks,
         )
 
     def close_up(self, image_px: int, match_scale: float = 1.0) -> CloseUp | None:

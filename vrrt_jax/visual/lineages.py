@@ -28,6 +28,7 @@ from vrrt_jax.visual.adam import adam_step, fresh_moments, losses_and_gradients
 
 JUMP_FIRST, JUMP_LAST = 0.8, 0.2  # [rad] standard deviations of a joint that a jump moves
 BESIDE = 1e-3  # [rad] a joint of a child that only repeats its parent with a gradient
+FARTHER = 1.5  # radius of an attempt, in units of the one before
 FEWEST_MOVED = 0.2  # share of its joints that a jump moves, at least, on average
 
 
@@ -86,10 +87,11 @@ class LineageRRT:
             edge_steps=num_checks(world, cls.MAX_STEP),
         )
 
-    def with_effort(self, factor: int) -> "LineageRRT":
-        """The same policy, with so many times as much to do in each stage."""
+    def again(self) -> "LineageRRT":
+        """The policy of the next attempt: twice as much to do in each stage, and farther around."""
         names = ("samples", "jumps", "steps", "young")
-        return dataclasses.replace(self, **{n: factor * getattr(self, n) for n in names})
+        more = {name: 2 * getattr(self, name) for name in names}
+        return dataclasses.replace(self, radius=FARTHER * self.radius, **more)
 
     @property
     def stages(self) -> Any:

@@ -51,8 +51,9 @@ LEAST_COVERED = 0.01  # share of a close-up; a hand that is hidden tells nothing
 class Polishing:
     """On which images configurations are polished, and how."""
 
-    coarse: Objective  # samples descend on this one
-    fine: Objective  # and the last of them on this one
+    soft: Objective  # samples descend on this one, as the search does
+    coarse: Objective  # the best of them settle on this one
+    fine: Objective  # and on this one
     close_up: CloseUp | None  # and their hands at last here
     config: PolishConfig
 
@@ -60,7 +61,7 @@ class Polishing:
     def arrays(self) -> Any:
         """A pytree of all that programs see of it."""
         close_up = self.close_up
-        return self.coarse, self.fine, None if close_up is None else close_up.objective
+        return self.soft, self.coarse, self.fine, None if close_up is None else close_up.objective
 
     @property
     def threshold(self) -> float:
@@ -127,12 +128,13 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
 
 def compile_polishing(world: World, polishing: Polishing) -> None:
     """Run every program of :func:`polish` once, at the start."""
-    coarse, fine = polishing.coarse, polishing.fine
+    soft, coarse, fine = polishing.soft, polishing.coarse, polishing.fine
     q = np.asarray(fine.prior.q)[None]
-    derivatives(world, coarse, q)
-    for goal in (coarse, fine):
+    derivatives(world, soft, q)
+    for goal in (soft, fine):
         evaluate_each(world, goal, q)
-    settle_each(world, [fine], q, 0)
+    for goal in (coarse, fine):
+        settle_each(world, [goal], q, 0)
     if polishing.close_up is not None:
         near = _hand_goal(world, fine, polishing.close_up, q[0])[0]
         settle_each(world, [near], q, 0)
@@ -141,16 +143,17 @@ def compile_polishing(world: World, polishing: Polishing) -> None:
 def _search_around(
     world: World, polishing: Polishing, q: np.ndarray, rng: np.random.Generator
 ) -> Ends:
-    """Rounds on the coarse image, until one matches: sample, descend, keep distinct ends."""
-    config, coarse = polishing.config, polishing.coarse
+    """Rounds on small images, until one matches: sample, descend, keep distinct ends."""
+    config, soft, coarse = polishing.config, polishing.soft, polishing.coarse
     for k in range(config.rounds):
         spread = config.spread * (SECOND_SPREAD if k == 1 else 1.0)
         around = sample_around(q, last_hinge(world), config.samples, spread, rng)
         samples = np.concatenate([around, redraw_outer(world, q, config.samples, rng)])
-        samples = nearer_turns(world, samples, np.asarray(coarse.prior.q))
-        cost = evaluate_each(world, coarse, samples)[1]
+        samples = nearer_turns(world, samples, np.asarray(soft.prior.q))
+        cost = evaluate_each(world, soft, samples)[1]
         best = samples[np.argsort(cost, kind="stable")[: config.lanes]]
-        ends = _distinct_ends(world, descend(world, coarse, best, config.steps), config.kept)
+        ends = _distinct_ends(world, descend(world, soft, best, config.steps), config.kept)
+        ends = _distinct_ends(world, _settled(world, coarse, ends.q), config.kept)
         if np.any(ends.free & (ends.cost <= float(coarse.goal.threshold))):
             break
         q = ends.q

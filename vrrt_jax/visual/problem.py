@@ -15,6 +15,8 @@ from vrrt_jax.visual.goal import ImageGoal
 from vrrt_jax.visual.least_squares import Objective, Parabola
 from vrrt_jax.visual.polish import Polishing
 
+SOFT_BLOCKS = (2, 4)  # [px] of the image that is searched
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class VisualProblem:
@@ -46,7 +48,9 @@ def make_problem(
     if isinstance(goal, ImageGoal):
         checks.check_self_model(robot, goal.self_model)
         scale = config.match.scale
-        search_goal: Any = goal.at(robot, config.tree.image_px, scale)
+        # What is judged on the image that is searched is judged by its pixels.
+        blocks = SOFT_BLOCKS if config.polish.hypotheses else ()
+        search_goal: Any = goal.at(robot, config.tree.image_px, scale, blocks)
         checks.check_cameras(robot, search_goal.splats, search_goal.cameras, q_start)
         coarse_goal = fine_goal = search_goal
         if config.polish.hypotheses:
@@ -61,6 +65,7 @@ def make_problem(
     polishing = None
     if config.polish.hypotheses and has_residuals:
         polishing = Polishing(
+            soft=_with_prior(search_goal, q_start, config),
             coarse=_with_prior(coarse_goal, q_start, config),
             fine=_with_prior(fine_goal, q_start, config),
             close_up=close_up,

@@ -12,7 +12,7 @@ from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import batch_link_poses, link_poses
 from vrrt_jax.scene.closed_form import ClosedFormWorld
 from vrrt_jax.scene.obstacles import load_obstacles, signed_distances
-from vrrt_jax.scene.world import World, batch_is_free, with_margin
+from vrrt_jax.scene.world import World, batch_is_free, pose_error, with_margin
 
 DISTANCE_TOLERANCE = 2e-5  # [m]; worst seen 4e-6, near a plane drawn as a 100 m box
 
@@ -255,3 +255,18 @@ def test_configurations_of_another_shape_are_refused(wall_world, shape):
             ValueError, match=r"has shape .*; expected \(7,\) for the joints joint1"
         ):
             ask(wall_world, np.zeros(shape, np.float32))
+
+
+def test_a_whole_turn_is_the_same_pose():
+    """Of hinges; a rail that is 2 pi meters off is elsewhere."""
+    ur5e, fetch = (vrrt_jax.load_robot(name) for name in ("ur5e", "fetch"))
+    world = vrrt_jax.build_world(ur5e, [], engine="closed_form")
+    off = np.array([0.1, 0.0, -0.2, 6.0, -4.0, 3.0])
+    error = pose_error(world, ur5e.home + off, ur5e.home)
+    expected = [0.1, 0.0, 0.2, 2 * np.pi - 6.0, 2 * np.pi - 4.0, 3.0]
+    np.testing.assert_allclose(error, expected, atol=1e-6)
+    world = vrrt_jax.build_world(fetch, [], engine="closed_form")
+    rail = np.flatnonzero(~np.asarray(world.chain.is_hinge))
+    assert len(rail) == 1
+    lifted = fetch.home + 6.0 * np.eye(fetch.num_joints)[rail[0]]
+    assert pose_error(world, lifted, fetch.home)[rail[0]] == pytest.approx(6.0)

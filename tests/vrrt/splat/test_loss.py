@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vrrt_jax.core.precision import double_precision
-from vrrt_jax.splat.loss import relit, weighted, weighted_goal
+from vrrt_jax.splat.loss import block_means, relit, weighted, weighted_goal
 from vrrt_jax.splat.types import GoalImage
 
 pytestmark = pytest.mark.light_compilation
@@ -87,3 +87,19 @@ def test_gradients_go_through_the_gains(rng):
         slope = jax.grad(squares)(0.0)
         difference = (squares(1e-6) - squares(-1e-6)) / 2e-6
         assert float(slope) == pytest.approx(float(difference), rel=1e-6)
+
+
+def test_block_means_are_those_of_overlapping_blocks(rng):
+    """Beyond the border there is nothing; a smooth image keeps its squared length."""
+    picture = rng.uniform(size=(2, 10, 14, 4)).astype(np.float32)
+    found = np.asarray(block_means(jnp.asarray(picture), (4,))).reshape(2, 6, 8, 4)
+    padded = np.pad(picture, [(0, 0), (2, 2), (2, 2), (0, 0)])
+    for row, column in [(0, 0), (1, 1), (3, 6), (5, 7)]:
+        block = padded[:, 2 * row : 2 * row + 4, 2 * column : 2 * column + 4]
+        np.testing.assert_allclose(
+            found[:, row, column], block.mean(axis=(1, 2)) * 4 / 2, rtol=1e-5
+        )
+    y, x = np.mgrid[:32, :32]
+    smooth = np.exp(-((y - 15) ** 2 + (x - 16) ** 2) / 50.0)[None, ..., None].astype(np.float32)
+    means = np.asarray(block_means(jnp.asarray(smooth), (2, 4)))
+    assert np.sum(means**2) == pytest.approx(np.sum(smooth**2), rel=0.05)

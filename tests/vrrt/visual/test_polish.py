@@ -1,5 +1,7 @@
 """Polishing: least squares where images tell little."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,6 +57,21 @@ def test_settling_ends_where_fresh_derivatives_at_each_step_do(
     assert np.all(settled.cost < 0.6 * before.cost)
     largest = np.abs(before.matrix).max()
     np.testing.assert_allclose(settled.matrix, before.matrix, atol=2e-3 * largest)
+
+
+def test_soft_images_lead_back_from_farther_away(panda, self_model, camera, open_world):
+    image = picture(panda, self_model, camera, Q_GOAL, level=2)
+    polishing = polishing_of(panda, self_model, camera, image, PlannerConfig())
+    sharp = dataclasses.replace(
+        polishing.soft, goal=dataclasses.replace(polishing.soft.goal, blocks=())
+    )
+    q = Q_GOAL + 0.3 * np.random.default_rng(0).normal(size=(8, 7)).astype(np.float32)
+    led_back = []
+    for objective in (polishing.soft, sharp):
+        ends = descend(open_world, objective, q, 8)
+        off = np.abs(ends.q - Q_GOAL)[:, :4]  # the image hardly tells the others
+        led_back.append(np.mean(off.max(axis=1) < 0.1))
+    assert led_back[0] >= led_back[1] + 0.25
 
 
 def test_polishing_turns_the_wrist_back(panda, self_model, camera, open_world):
