@@ -10,8 +10,9 @@ import numpy as np
 
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.compiling import compile_together
-from vrrt_jax.core.edges import enforce_bounds
 from vrrt_jax.core.interrupt import interruptible
+from vrrt_jax.core.parallel import map_on_threads
+from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.result import ABORTED, PlanResult, Status, with_time_of
 from vrrt_jax.core.search import compile_search, make_termination, search
 from vrrt_jax.core.shortcut import shortcut
@@ -19,7 +20,7 @@ from vrrt_jax.core.timing import timed
 from vrrt_jax.core.types import ExpansionPolicy, Goal, Tree
 from vrrt_jax.outcome import Progress, time_left
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.world import World, batch_is_free
+from vrrt_jax.scene.world import World
 from vrrt_jax.visual import lineages
 from vrrt_jax.visual import policy as published
 from vrrt_jax.visual.finish import finish_visual
@@ -29,6 +30,8 @@ from vrrt_jax.visual.polish import compile_polishing
 from vrrt_jax.visual.problem import VisualProblem
 
 ATTEMPT_KEY = 0x7FFFFFFF  # folded into the key of a later attempt; iterations count from 0
+MORE_EACH = 2  # attempts that do more than the one before
+ROOT_SAMPLES, ROOT_BATCHES = 4096, 8  # random configurations, of which some are roots
 RETRYABLE = (Status.NO_MATCH, Status.NO_PATH, Status.NOT_VERIFIED)  # worth another attempt
 
 
@@ -44,7 +47,8 @@ def plan_by_loss(
 ) -> PlanResult:
     """Attempts with different keys, until one is solved; the best of them.
 
-    Most goals are found at once. So the first attempt is short, and each later one twice as long.
+    Most goals are found at once. So the first attempt is short; the second takes twice as long, and
+    the others four times.
     """
     with interruptible():
         result = attempt(robot, world, problem, policy, roots, key, config, on_progress)
@@ -55,12 +59,12 @@ def plan_by_loss(
             if not goes_on or rest.budget.time_limit_s == 0:
                 break
             key = jax.random.fold_in(key, ATTEMPT_KEY - again)
-            # Where the start is walled in, what its tree does not reach is looked at too.
+            # The start's tree may not get there: it is walled in, or the goal is far away.
             places = roots
             if isinstance(policy, LineageRRT):
-                policy = policy.again()
-                room = config.tree.capacity - policy.lanes - len(roots)
-                others = free_around(world, policy, roots[0], key)[:room]
+                policy = policy.again() if again <= MORE_EACH else policy
+                room = min(policy.num - 2, config.tree.capacity - policy.lanes - len(roots))
+                others = promising_roots(world, problem.goal, key, max(room, 0))
                 places = np.concatenate([roots, others])
             other = attempt(robot, world, problem, policy, places, key, rest, on_progress)
             if other.status in ABORTED and not other.ok:
@@ -82,14 +86,15 @@ def _rank(result: PlanResult) -> tuple[bool, float]:
     return not result.ok, result.colored_loss if known else result.loss
 
 
-def free_around(
-    world: World, policy: LineageRRT, q_start: np.ndarray, key: jax.Array
-) -> np.ndarray:
-    """Free configurations (at most L - 2, D) around a start, one for most of the lineages."""
+def promising_roots(world: World, goal: Goal, key: jax.Array, num: int) -> np.ndarray:
+    """The best (at most num, D) of free configurations drawn anywhere inside the limits."""
     key = jax.random.fold_in(key, ATTEMPT_KEY)
-    steps = lineages.steps_in_ball(key, 8 * policy.num, len(q_start), policy.radius)
-    q = enforce_bounds(world, jnp.asarray(q_start) + steps)
-    return np.asarray(q)[np.asarray(batch_is_free(world, q))][: max(policy.num - 2, 0)]
+    q = np.asarray(sample_configurations(world, key, ROOT_SAMPLES))
+    parts = map_on_threads(
+        lambda part: lineages.losses_where_free(world, goal, part), np.split(q, ROOT_BATCHES)
+    )
+    loss = np.concatenate(parts)
+    return q[np.argsort(loss, kind="stable")[: min(num, np.sum(np.isfinite(loss)))]]
 
 
 def attempt(

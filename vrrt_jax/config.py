@@ -27,7 +27,7 @@ class LineageConfig:
     num: int = setting(64, 0, 1024)  # lineages; 0 = the published planner instead (re-compiles)
     trees: int = setting(2, 1, 64)  # such trees grow at once, one a core, and become one tree
     radius: float = setting(2.8, 0.0)  # how far edges scatter from the start [rad]
-    # Of the first attempt; each later one does twice as much as the one before.
+    # Of the first attempt; the second does twice as much, and the later ones four times.
     samples: int = setting(128, 1, 1 << 20)  # edges that scatter
     jumps: int = setting(8, 0, 1 << 20)  # random changes of each lineage's best node
     steps: int = setting(8, 1, 100_000)  # Adam steps of a lineage
@@ -88,7 +88,7 @@ class Budget:
     patience: int | None = setting(None, 1, optional=True)
     min_improvement: float = setting(0.0, 0.0)  # an improvement is a loss this much smaller ...
     min_ratio: float = setting(0.97, 0.0, 1.0)  # ... and below this share of the one before
-    attempts: int = setting(4, 1, 1024)  # the later ones with other keys, without a verified path
+    attempts: int = setting(6, 1, 1024)  # the later ones with other keys, without a verified path
     # Of all searches, compilation excluded [s].
     time_limit_s: float = setting(float("inf"), 0.0, endless=True)
     connect_iterations: int = setting(400, 1)  # of RRT-Connect, to a match

@@ -260,6 +260,12 @@ def _losses(world: World, goal: Goal, q: jax.Array) -> jax.Array:
     return map_lanes(lambda q: goal.loss(world, q), q)
 
 
+@host_jit
+def losses_where_free(world: World, goal: Goal, q: jax.Array) -> jax.Array:
+    """Losses (n,) of configurations (n, D), infinite in collision."""
+    return jnp.where(jax.vmap(world.is_free)(q), _losses(world, goal, q), jnp.inf)
+
+
 def steps_in_ball(key: jax.Array, num: int, joints: int, radius: Any) -> jax.Array:
     """Random steps (n, D) inside a ball; their length is uniform, so that short ones are many."""
     key_direction, key_length = jax.random.split(key)
