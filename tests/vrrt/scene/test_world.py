@@ -60,7 +60,7 @@ def test_distance_outside_equals_mujoco(kind, panda, rng):
     world = vrrt_jax.build_world(panda, obstacles)
     points = rng.uniform(-1, 1, (200, 3))
     distances = jax.jit(signed_distances)(world.obstacles, jnp.asarray(points.T, jnp.float32))
-    ours = np.asarray(distances)
+    ours = np.asarray(distances).T
     theirs = mujoco_distances(obstacles, points)
     outside = theirs > 2e-3
     assert outside.sum() > 50

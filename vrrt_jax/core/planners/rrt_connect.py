@@ -205,12 +205,12 @@ class RRTConnect:
 
     def halves(self, tree: Tree[ConnectNode]) -> tuple[np.ndarray, np.ndarray] | None:
         """Nodes from the start, and from the goal, to where the trees met; None if they did not."""
-        cost = _costs(tree)
-        best = int(jnp.argmin(cost))
+        cost = np.asarray(_all_costs(tree))
+        best = int(cost.argmin())
         if not np.isfinite(cost[best]):
             return None
-        other = int(tree.payload.meets[best])
-        if int(tree.payload.side[best]) == 1:
+        other = int(np.asarray(tree.payload.meets)[best])
+        if int(np.asarray(tree.payload.side)[best]) == 1:
             best, other = other, best
         return trees.lineage(tree, best), trees.lineage(tree, other)
 
@@ -224,3 +224,6 @@ def _costs(tree: Tree[ConnectNode]) -> jax.Array:
     other = tree.payload.meets
     met = trees.occupied(tree) & (other >= 0)
     return jnp.where(met, tree.cost + tree.cost[jnp.maximum(other, 0)], jnp.inf)
+
+
+_all_costs = jax.jit(_costs)  # for the host
