@@ -12,7 +12,7 @@ from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import batch_link_poses, link_poses
 from vrrt_jax.scene.closed_form import ClosedFormWorld
 from vrrt_jax.scene.obstacles import load_obstacles, signed_distances
-from vrrt_jax.scene.world import World, batch_is_free, with_margin
+from vrrt_jax.scene.world import World, batch_clearance, batch_is_free, with_margin
 
 DISTANCE_TOLERANCE = 2e-5  # [m]; worst seen 4e-6, near a plane drawn as a 100 m box
 
@@ -255,3 +255,13 @@ def test_configurations_of_another_shape_are_refused(wall_world, shape):
             ValueError, match=r"has shape .*; expected \(7,\) for the joints joint1"
         ):
             ask(wall_world, np.zeros(shape, np.float32))
+
+
+def test_the_smallest_clearance_is_that_of_the_first_ones(wall_world, rng):
+    q = rng.uniform(wall_world.lower, wall_world.upper, (150, 7)).astype(np.float32)
+    each = np.array(jax.vmap(wall_world.obstacle_clearance)(jnp.asarray(q)))
+    q, each = q[np.argsort(-each)], np.sort(each)[::-1]  # the nearest to obstacles last
+    # Whole blocks of 64 are looked at.
+    for num, last in ((1, 63), (64, 63), (100, 127), (150, 149)):
+        assert float(batch_clearance(wall_world, q, num)) == pytest.approx(each[last], abs=1e-6)
+    assert each[127] > each[149] + 1e-3
