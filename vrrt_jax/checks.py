@@ -81,7 +81,7 @@ def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.n
             f"this one, '{robot.name}', are at {dict(robot.frozen)}: build the world for it"
         )
     q = check_limits(robot, q, what)
-    if not bool(batch_is_free(world, jnp.asarray(q)[None])[0]):
+    if not bool(batch_is_free(world, q[None])):
         touching = (
             contacts(robot, world, q)
             or contacts(robot, world, q, geometry="spheres")

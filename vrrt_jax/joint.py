@@ -5,13 +5,12 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.check_protocols import check_extracted_path
 from vrrt_jax.core.command import usable_cores
-from vrrt_jax.core.goal import ConfigurationGoal, starts_at
+from vrrt_jax.core.goal import ConfigurationGoal, nearest_and_loss, starts_at
 from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import ABORTED, STATUS_OF, PlanResult, Status, with_time_of
@@ -119,11 +118,11 @@ def _chosen(
     world: World, goal: ConfigurationGoal, path: np.ndarray | None, q_start: np.ndarray
 ) -> Chosen:
     """Where a path, or the start without one, stands to the goal."""
-    end = q_start if path is None else path[-1]
+    nearest, loss = nearest_and_loss(goal, world, q_start if path is None else path[-1])
     return Chosen(
         path=path,
-        target=np.asarray(goal.nearest(world, jnp.asarray(end))),
-        loss=float(goal.loss(world, jnp.asarray(end))),
+        target=np.asarray(nearest),
+        loss=float(loss),
         threshold=float(goal.threshold),
     )
 

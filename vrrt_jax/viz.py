@@ -105,17 +105,17 @@ def _draw_obstacles(world: World, camera: Camera) -> tuple[np.ndarray, np.ndarra
         depth = jax.lax.fori_loop(
             0,
             MARCHING_STEPS,
-            lambda _, d: d + jnp.min(distances(d), axis=1) / stretch,
+            lambda _, d: d + jnp.min(distances(d), axis=0) / stretch,
             jnp.zeros_like(stretch),
         )
         point, distance = eye[:, None] + depth * rays, distances(depth)
-        hit = (jnp.min(distance, axis=1) < HIT_M) & (depth < FARTHEST_M)
+        hit = (jnp.min(distance, axis=0) < HIT_M) & (depth < FARTHEST_M)
         # The gradient of the distance is the surface's normal.
-        normal = jax.grad(lambda p: jnp.sum(jnp.min(signed_distances(world.obstacles, p), axis=1)))(
+        normal = jax.grad(lambda p: jnp.sum(jnp.min(signed_distances(world.obstacles, p), axis=0)))(
             point
         )
         facing = jnp.abs(jnp.sum(normal * rays, axis=0)) / stretch
-        return depth, hit, jnp.argmin(distance, axis=1), facing
+        return depth, hit, jnp.argmin(distance, axis=0), facing
 
     depth, hit, nearest, facing = (np.asarray(a) for a in trace(rays, stretch))
     # A lamp on the camera: surfaces that face it are brighter.

@@ -36,6 +36,7 @@ def free_prefix(
     num_steps: int,
     tried: jax.Array | bool = True,
     partial: jax.Array | bool = True,
+    slack: int = 0,
 ) -> tuple[jax.Array, jax.Array]:
     """How far one can go along edges before something is touched.
 
@@ -48,6 +49,8 @@ def free_prefix(
         tried: (B,) bool, which edges count; the others are not checked.
         partial: (B,) bool, of which the free part matters. Of the others only whether they are free
             is asked: if they are not, the number is some number below S.
+        slack: the number may be up to so many below the true one. Next to what is touched distances
+            vouch for little, so that the last sub-steps cost most.
 
     Returns:
         (B,) i32 number of leading sub-steps that are free, S where the whole edge is; and () i32
@@ -55,11 +58,12 @@ def free_prefix(
     """
 
     def matters(checks: _Checks, step: jax.Array) -> jax.Array:
-        return tried & (step < jnp.where(partial | (checks.first == num_steps), checks.first, 0))
+        before = jnp.where(partial, checks.first - slack, 0)
+        return tried & (step < jnp.where(checks.first == num_steps, num_steps, before))
 
     checks = _check(world, q_from, edge, num_steps, matters)
     # Sub-steps between the last free check and the first blocked one may be either.
-    vouched = checks.first // checks.stride * checks.stride
+    vouched = jnp.maximum(checks.first - slack, 0) // checks.stride * checks.stride
     return jnp.where(checks.first == num_steps, num_steps, vouched), checks.checked
 
 

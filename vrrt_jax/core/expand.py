@@ -36,9 +36,8 @@ def expand(
     edge = world.steer(q_from, proposals.target, policy.edge_steps)
 
     # Check edges: how many leading sub-steps are free. A blocked edge is cut there, or given up.
-    num_free, checked = free_prefix(
-        world, q_from, edge, policy.edge_steps, proposals.valid, proposals.partial
-    )
+    asked = proposals.valid, proposals.partial, getattr(policy, "edge_slack", 0)
+    num_free, checked = free_prefix(world, q_from, edge, policy.edge_steps, *asked)
     free = (num_free == policy.edge_steps) | (proposals.partial & (num_free > 0))
     edge = world.truncate(edge, num_free / policy.edge_steps)
     length = world.length(edge)

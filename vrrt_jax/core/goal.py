@@ -37,8 +37,19 @@ class ConfigurationGoal:
 
 def starts_at(goal: ConfigurationGoal, world: Any, q_start: Any) -> bool:
     """Whether a plan that starts at ``q_start`` (D,) is at its goal; on the host."""
-    far = float(goal.loss(world, jnp.asarray(q_start)))
+    far = float(nearest_and_loss(goal, world, q_start)[1])
     return far <= min(float(goal.threshold), REACHED)
+
+
+@jax.jit
+def nearest_and_loss(
+    goal: ConfigurationGoal, world: Any, q: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The goal (D,) that is nearest to a configuration (D,), and the loss () there; for the host.
+
+    One program: operation by operation this takes many times as long as it computes.
+    """
+    return goal.nearest(world, q), goal.loss(world, q)
 
 
 class LeastSquaresGoal(PytreeSubclasses):

@@ -253,7 +253,9 @@ def _descend(
 
     def distance(spheres, points):
         center, radius = spheres
-        gap = jnp.linalg.norm(points[:, None] - center, axis=-1) - radius
+        # A center may be one of the points: the derivative of a norm is not a number there.
+        squared = jnp.sum((points[:, None] - center) ** 2, axis=-1)
+        gap = jnp.sqrt(squared + 1e-12) - radius
         return jnp.min(jnp.where(used, gap, jnp.inf), axis=-1)
 
     def loss(spheres, progress):

@@ -210,7 +210,7 @@ def _distances(
     """Distances (n, K) of points (n, 3) in a frame that has a pose (4, 4) to obstacles [m]."""
     slots = to_slots(obstacles, len(obstacles))
     centers = jnp.asarray(_moved(to_world, points).T, jnp.float32)
-    return np.asarray(signed_distances(slots, centers), np.float64)
+    return np.asarray(signed_distances(slots, centers).T, np.float64)
 
 
 def _checked(world: World, q: Any) -> np.ndarray:

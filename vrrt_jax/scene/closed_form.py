@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import jax
-import jax.numpy as jnp
 
 from vrrt_jax.core.check_protocols import overrides_is_free
 from vrrt_jax.core.precision import single_precision
@@ -31,12 +30,7 @@ class ClosedFormWorld(World):
     @single_precision
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.is_free`."""
-        poses, spheres = link_poses(self.chain, q), self.spheres
-        centers = place(spheres.collision, poses)
-        clearance = spheres.clearances(self.obstacles, centers, self.margin)
-        gap = spheres.squared_gaps(place(spheres.self_collision, poses))
-        # A robot of few links may have no pair to check: then nothing can touch.
-        return (jnp.min(clearance) > 0) & (jnp.min(gap, initial=jnp.inf) >= 0)
+        return self.spheres.are_free(self.obstacles, self.margin, link_poses(self.chain, q))
 
     def free_span(self, q: jax.Array, edge: jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`: distances divided by the speeds of the spheres.
@@ -46,7 +40,10 @@ class ClosedFormWorld(World):
         if overrides_is_free(self):
             return super().free_span(q, edge)
         poses, spheres = link_poses(self.chain, q), self.spheres
-        centers = place(spheres.collision, poses), place(spheres.self_collision, poses)
+        # Behind a barrier the centers are computed once, and not again for every obstacle.
+        centers = jax.lax.optimization_barrier(
+            (place(spheres.collision, poses), place(spheres.self_collision, poses))
+        )
         return spheres.free_span(self.obstacles, self.margin, centers, edge)
 
     @single_precision

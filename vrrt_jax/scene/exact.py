@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -69,13 +69,17 @@ class ExactScene:
     @property
     def model(self) -> mujoco.MjModel:
         """The model, with this scene's obstacles in place."""
+        return self._placed().model
+
+    def _placed(self) -> _Compiled:
+        """This thread's copy, with this scene's obstacles in place."""
         own = self.compiled
         if own.holder is not self:
             place_obstacles(own.model, own.slots, self.obstacles)
             for body, held in zip(own.held_bodies, self.attached, strict=True):
                 place(own.model, own.model.body_geomadr[body], held.obstacle)
             own.holder = self
-        return own.model
+        return own
 
     @property
     def data(self) -> mujoco.MjData:
@@ -110,10 +114,20 @@ class ExactScene:
             q: (D,); negative distances are penetrations. How deep an object may be in its support
                 is no penetration.
         """
-        distance, bodies = near_pairs(self.model, self.data, q)
-        if self.attached:
-            distance = distance + self.allowed[bodies[:, 0], bodies[:, 1]]
-        return distance, bodies
+        return self.near_in_a_row()(q)
+
+    def near_in_a_row(self) -> Callable[[np.ndarray], Near]:
+        """:meth:`near` of many configurations, as long as no other scene is asked meanwhile."""
+        own = self._placed()
+        model, data = own.model, own.data
+
+        def near(q: np.ndarray) -> Near:
+            distance, bodies = near_pairs(model, data, q)
+            if self.attached:
+                distance = distance + self.allowed[bodies[:, 0], bodies[:, 1]]
+            return distance, bodies
+
+        return near
 
     def depths(self, name: str, q: np.ndarray) -> dict[str, float]:
         """How deep a held object is in obstacles at ``q`` (D,), by their names [m].

@@ -97,26 +97,22 @@ def lever_arms(model: mujoco.MjModel) -> np.ndarray:
     """
     # The farthest point of a body's geoms from the body's frame.
     extent = np.zeros(model.nbody)
-    for geom in np.flatnonzero(model.body_weldid[model.geom_bodyid] != 0):
-        body = model.geom_bodyid[geom]
-        center, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-        reach = np.linalg.norm(model.geom_pos[geom]) + np.linalg.norm(center)
-        extent[body] = max(extent[body], reach + np.linalg.norm(half))
+    is_moving = model.body_weldid[model.geom_bodyid] != 0
+    boxes = model.geom_pos, model.geom_aabb[:, :3], model.geom_aabb[:, 3:]
+    reach = sum(np.linalg.norm(part[is_moving], axis=1) for part in boxes)
+    np.maximum.at(extent, model.geom_bodyid[is_moving], reach)
     arms = np.zeros((model.nq, model.nbody))
-    for body in range(1, model.nbody):
+    is_slide = model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE
+    offset, anchor = (np.linalg.norm(part, axis=1) for part in (model.body_pos, model.jnt_pos))
+    travel = np.where(is_slide, np.abs(model.jnt_range).max(axis=1), 0.0)
+    for body in np.flatnonzero(model.body_weldid):
         # From the body towards the base: the length of the way so far.
         length, at = extent[body], body
         while at:
-            first, count = model.body_jntadr[at], model.body_jntnum[at]
-            for joint in range(first, first + count):
-                is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-                arms[joint, body] = (
-                    1.0 if is_slide else length + np.linalg.norm(model.jnt_pos[joint])
-                )
-            for joint in range(first, first + count):
-                if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
-                    length += np.abs(model.jnt_range[joint]).max()
-            length += np.linalg.norm(model.body_pos[at])
+            first = model.body_jntadr[at]
+            joints = slice(first, first + model.body_jntnum[at]) if first >= 0 else slice(0)
+            arms[joints, body] = np.where(is_slide[joints], 1.0, length + anchor[joints])
+            length += travel[joints].sum() + offset[at]
             at = model.body_parentid[at]
     carries = arms > 0
     between = carries[:, :, None] != carries[:, None]

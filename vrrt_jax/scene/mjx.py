@@ -193,7 +193,7 @@ class MjxScene:
         centers = data.geom_xpos[spheres].T
         if self.room[-1]:
             distances = signed_distances(geoms.measured, centers)
-            free &= jnp.all(distances > radii[spheres, None])
+            free &= jnp.all(distances > radii[spheres])
         return free, centers, data.geom_xpos[np.flatnonzero(self.is_self_collision_sphere)].T
 
     @functools.cached_property

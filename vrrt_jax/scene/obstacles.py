@@ -47,22 +47,24 @@ class Obstacles:
 
 
 def signed_distances(obstacles: Obstacles, points: jax.Array) -> jax.Array:
-    """Exact distances (n, K) [m] from points (3, n) to obstacles, negative inside."""
-    # Into each obstacle's frame, axis by axis: XLA's CPU backend is slow on small products.
-    offset = points[:, :, None] - obstacles.position.T[:, None]
+    """Exact distances (K, n) [m] from obstacles to points (3, n), negative inside."""
+    # Into each obstacle's frame, axis by axis: XLA's CPU backend is slow on small products. Points
+    # come last: there are more of them, and loops over the last axis are the ones it vectorizes.
+    offset = points[:, None] - obstacles.position.T[:, :, None]
     x, y, z = (
-        sum(offset[i] * obstacles.rotation[:, i, axis] for i in range(3)) for axis in range(3)
+        sum(offset[i] * obstacles.rotation[:, i, axis, None] for i in range(3)) for axis in range(3)
     )
     # How far outside the faces. A round section has one face all around, at the radius half_x.
-    half_x, half_y, half_z = obstacles.half.T
+    half_x, half_y, half_z = obstacles.half.T[:, :, None]
+    is_round = obstacles.is_round[:, None]
     radial = jnp.sqrt(x * x + y * y + 1e-20)
-    x = jnp.where(obstacles.is_round, radial, jnp.abs(x)) - half_x
-    y = jnp.where(obstacles.is_round, -half_x, jnp.abs(y) - half_y)
+    x = jnp.where(is_round, radial, jnp.abs(x)) - half_x
+    y = jnp.where(is_round, -half_x, jnp.abs(y) - half_y)
     z = jnp.abs(z) - half_z
     # Outside: the distance to the nearest face, edge or corner. Inside: to the nearest face.
     outside = sum(jnp.maximum(axis, 0.0) ** 2 for axis in (x, y, z))
     inside = jnp.minimum(jnp.maximum(x, jnp.maximum(y, z)), 0.0)
-    return jnp.sqrt(outside + 1e-20) + inside - obstacles.rounding
+    return jnp.sqrt(outside + 1e-20) + inside - obstacles.rounding[:, None]
 
 
 def load_obstacles(path: str | Path) -> list[Obstacle]:

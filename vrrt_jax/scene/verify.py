@@ -89,7 +89,7 @@ def _first_contact(
 
     Those that the robot cannot have reached a contact at, for the distances before, are left out.
     """
-    checked = 0
+    checked, near = 0, exact.near_in_a_row()
     for segment, q_from in enumerate(path):
         # Up to the next waypoint, or to where the walk ends in this segment.
         inside = (end - walk.first[segment]) / walk.steps[segment]
@@ -97,7 +97,7 @@ def _first_contact(
             break
         length = float(np.linalg.norm(walk.turn[segment]))
         at, looked = first_touch(
-            exact.near,
+            near,
             exact.lever_arms,
             q_from,
             walk.turn[segment],

@@ -32,6 +32,7 @@ _NO_ENGINE = (
     "or vrrt_jax.ClosedFormWorld"
 )
 ENGINES = ("mjx", "closed_form")
+_BLOCK = 64  # configurations that are measured at once
 
 
 FINER = 4  # times as fine are the checks of edges once the exact check has refused a path
@@ -109,9 +110,21 @@ batch_is_free = single_precision(jax.jit(jax.vmap(is_free, (None, 0))))
 
 @single_precision
 @jax.jit
-def batch_clearance(world: "World", q: jax.Array) -> jax.Array:
-    """The smallest clearance () of q (n, D), for the host."""
-    return jnp.min(jax.vmap(lambda q: world.obstacle_clearance(q))(q))
+def batch_clearance(world: "World", q: jax.Array, num: jax.Array | int) -> jax.Array:
+    """The smallest clearance () of the first ``num`` of q (n, D), for the host.
+
+    It is looked for block by block, so that what only fills up to ``n`` costs nothing.
+    """
+    size = min(_BLOCK, len(q))
+
+    def look(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        first, least = state  # the last block begins early enough to be a whole one
+        block = jax.lax.dynamic_slice_in_dim(q, first, size)
+        here = jax.vmap(lambda q: world.obstacle_clearance(q))(block)
+        return first + size, jnp.minimum(least, jnp.min(here))
+
+    start = jnp.int32(0), jnp.float32(jnp.inf)
+    return jax.lax.while_loop(lambda state: state[0] < num, look, start)[1]
 
 
 @single_precision

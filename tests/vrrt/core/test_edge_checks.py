@@ -73,3 +73,18 @@ def test_edges_without_length_take_one_check_and_those_without_numbers_are_block
     count, _ = ask(world, jnp.stack([start, start]), edge, 64)
     assert count.tolist() == [64, 0]
     assert int(ask(world, jnp.stack([start, start]), jnp.zeros((2, 7)), 64)[1]) == 2
+
+
+def test_slack_spares_the_checks_next_to_what_blocks_an_edge(wall_world):
+    """The prefix ends up to so many sub-steps earlier; edges that are free are found free."""
+    world, start = Counted(**vars(wall_world)), jnp.asarray(START)
+    share = jnp.append(jnp.linspace(0.8, 1.0, 15), 0.05)[:, None]
+    edge = wall_world.edge(start, jnp.asarray(GOAL)) * share
+    ask = jax.jit(free_prefix, static_argnums=(3, 6))
+    starts = jnp.tile(start, (16, 1))
+    exact, all_checks = ask(world, starts, edge, 64, True, True, 0)
+    early, few_checks = ask(world, starts, edge, 64, True, True, 3)
+    less = np.asarray(exact - early)
+    assert np.all(np.asarray(exact)[:15] < 64) and int(exact[15]) == int(early[15]) == 64
+    assert np.all((less >= 0) & (less <= 3)) and less.any()
+    assert int(few_checks) <= int(all_checks) - 15

@@ -1,5 +1,7 @@
 """RRT, RRT-IS, RRT* and RRT-Connect to a joint goal."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -97,3 +99,10 @@ def test_rrt_is_keeps_every_sub_step(panda, wall_world):
     first = np.asarray(tree.q[1:size])[np.asarray(tree.parent[1:size]) == 0]
     lengths = np.sort(np.linalg.norm(first - START, axis=1))
     assert lengths[0] <= float(wall_world.resolution) + 1e-5
+
+
+def test_rrt_connect_gives_up_a_sixteenth_of_blocked_edges_however_fine_they_are(wall_world):
+    for resolution, steps in ((0.02, 128), (0.005, 512)):
+        world = dataclasses.replace(wall_world, resolution=jnp.float32(resolution))
+        policy = PLANNERS["rrt-connect"].for_world(world)
+        assert (policy.edge_steps, policy.edge_slack) == (steps, steps // 16)

@@ -12,7 +12,7 @@ from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import batch_link_poses, link_poses
 from vrrt_jax.scene.closed_form import ClosedFormWorld
 from vrrt_jax.scene.obstacles import load_obstacles, signed_distances
-from vrrt_jax.scene.world import World, batch_is_free, pose_error, with_margin
+from vrrt_jax.scene.world import World, batch_clearance, batch_is_free, pose_error, with_margin
 
 DISTANCE_TOLERANCE = 2e-5  # [m]; worst seen 4e-6, near a plane drawn as a 100 m box
 
@@ -60,7 +60,7 @@ def test_distance_outside_equals_mujoco(kind, panda, rng):
     world = vrrt_jax.build_world(panda, obstacles)
     points = rng.uniform(-1, 1, (200, 3))
     distances = jax.jit(signed_distances)(world.obstacles, jnp.asarray(points.T, jnp.float32))
-    ours = np.asarray(distances)
+    ours = np.asarray(distances).T
     theirs = mujoco_distances(obstacles, points)
     outside = theirs > 2e-3
     assert outside.sum() > 50
@@ -270,3 +270,13 @@ def test_a_whole_turn_is_the_same_pose():
     assert len(rail) == 1
     lifted = fetch.home + 6.0 * np.eye(fetch.num_joints)[rail[0]]
     assert pose_error(world, lifted, fetch.home)[rail[0]] == pytest.approx(6.0)
+
+
+def test_the_smallest_clearance_is_that_of_the_first_ones(wall_world, rng):
+    q = rng.uniform(wall_world.lower, wall_world.upper, (150, 7)).astype(np.float32)
+    each = np.array(jax.vmap(wall_world.obstacle_clearance)(jnp.asarray(q)))
+    q, each = q[np.argsort(-each)], np.sort(each)[::-1]  # the nearest to obstacles last
+    # Whole blocks of 64 are looked at.
+    for num, last in ((1, 63), (64, 63), (100, 127), (150, 149)):
+        assert float(batch_clearance(wall_world, q, num)) == pytest.approx(each[last], abs=1e-6)
+    assert each[127] > each[149] + 1e-3

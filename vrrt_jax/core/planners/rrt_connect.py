@@ -47,15 +47,19 @@ class RRTConnect:
     """
 
     MAX_STEP: ClassVar[float] = 2.56  # [rad] long, as edges are free in large pieces or not at all
+    SLACK: ClassVar[float] = 1 / 16  # of an edge that is blocked
 
     margin: Any = 1.0  # how far from the ends half of the samples are drawn [rad]
     lanes: int = static(default=32)
     edge_steps: int = static(default=128)
+    # Sub-steps by which a blocked edge is cut before it has to be: the last ones cost most checks.
+    edge_slack: int = static(default=0)
 
     @classmethod
     def for_world(cls, world: Space, **settings: Any) -> Self:
         """The planner with steps of the same length, however fine the world's checks are."""
-        return cls(edge_steps=num_checks(world, cls.MAX_STEP), **settings)
+        steps = num_checks(world, cls.MAX_STEP)
+        return cls(edge_steps=steps, edge_slack=int(cls.SLACK * steps), **settings)
 
     def init(
         self, world: Space, goal: ConfigurationGoal, q_roots: Any, capacity: int
@@ -205,12 +209,12 @@ class RRTConnect:
 
     def halves(self, tree: Tree[ConnectNode]) -> tuple[np.ndarray, np.ndarray] | None:
         """Nodes from the start, and from the goal, to where the trees met; None if they did not."""
-        cost = _costs(tree)
-        best = int(jnp.argmin(cost))
+        cost = np.asarray(_all_costs(tree))
+        best = int(cost.argmin())
         if not np.isfinite(cost[best]):
             return None
-        other = int(tree.payload.meets[best])
-        if int(tree.payload.side[best]) == 1:
+        other = int(np.asarray(tree.payload.meets)[best])
+        if int(np.asarray(tree.payload.side)[best]) == 1:
             best, other = other, best
         return trees.lineage(tree, best), trees.lineage(tree, other)
 
@@ -224,3 +228,6 @@ def _costs(tree: Tree[ConnectNode]) -> jax.Array:
     other = tree.payload.meets
     met = trees.occupied(tree) & (other >= 0)
     return jnp.where(met, tree.cost + tree.cost[jnp.maximum(other, 0)], jnp.inf)
+
+
+_all_costs = jax.jit(_costs)  # for the host
