@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nrp_jax.planners.drive import Folded, compile_drive, find_drive
+from nrp_jax.planners.drive import LENGTH, Folded, compile_drive, find_drive
 from nrp_jax.planners.nrp_connect import NRPConnect, search_connect
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.goal import ConfigurationGoal
@@ -61,13 +61,14 @@ def search_by_drive(
         used = sum(int(one.tree.iteration) for one in found)
         most = np.int32(min(int(most), int(termination.max_iterations) - used))
         return {
-            "key": jax.random.fold_in(key, len(found)),
+            "key": jax.random.fold_in(key, len(found)) if found else key,
             "termination": dataclasses.replace(termination, max_iterations=most),
             "time_limit_s": time_limit_s - drive_s - sum(one.search_s for one in found),
             **options,
         }
 
     straight, ends = policy.straight(), np.stack([tree.q[0], goal.q])
+    room = LENGTH + 2 + MOST * straight.lanes  # more than such a search can fill
     for rank in RANKS if folded is not None else ():
         started = time.perf_counter()
         drive = find_drive(world, folded, *ends, rank=rank)
@@ -76,7 +77,7 @@ def search_by_drive(
             break
         towards, halves = ConfigurationGoal(q=jnp.asarray(drive)), []
         for end in ends:
-            forest = straight.init(world, towards, end[None], tree.capacity)
+            forest = straight.init(world, towards, end[None], room)
             found.append(search(world, towards, straight, forest, **left(MOST)))
             found[-1].history[:, COST] = np.inf  # half a path is none
             if found[-1].stopped is not StopReason.REACHED:

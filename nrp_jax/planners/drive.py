@@ -131,10 +131,13 @@ def compile_drive(world: GridWorld) -> float:
 @host_jit
 def _checked(world: GridWorld, q: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Which configurations (K, D) are free, (K,), and which edges to the next, (K - 1,)."""
-    stands = jax.vmap(world.is_free)(q)
-    edge = world.edge(q[:-1], q[1:])
-    free, _ = is_edge_free(world, q[:-1], edge, LENGTH, tried=stands[:-1] & stands[1:])
-    return stands, free & world.is_resolved(edge, LENGTH)
+    # An edge without length is free where its end is: so there is one program of checks.
+    q_from, q_to = jnp.concatenate([q, q[:-1]]), jnp.concatenate([q, q[1:]])
+    edge = world.edge(q_from, q_to)
+    free, _ = is_edge_free(world, q_from, edge, LENGTH)
+    free &= world.is_resolved(edge, LENGTH)
+    stands, joined = free[: len(q)], free[len(q) :]
+    return stands, joined & stands[:-1]
 
 
 def _base_drive(
