@@ -69,9 +69,9 @@ def search_by_drive(
 
     straight, ends = policy.straight(), np.stack([tree.q[0], goal.q])
     room = LENGTH + 2 + MOST * straight.lanes  # more than such a search can fill
-    for rank in RANKS if folded is not None else ():
+    for rank in RANKS:
         started = time.perf_counter()
-        drive = find_drive(world, folded, *ends, rank=rank)
+        drive = None if folded is None else find_drive(world, folded, *ends, rank=rank)
         drive_s += time.perf_counter() - started
         if drive is None:
             break
