@@ -12,8 +12,10 @@ import numpy as np
 from nrp_jax.config import PlannerConfig
 from nrp_jax.homes.grid import Grid
 from nrp_jax.homes.top_view import TopView
+from nrp_jax.planners.by_drive import search_by_drive
 from nrp_jax.planners.by_name import PLANNERS, policy_of
-from nrp_jax.planners.nrp_connect import NRPConnect, default_planner, search_connect
+from nrp_jax.planners.drive import folded_postures
+from nrp_jax.planners.nrp_connect import NRPConnect, default_planner
 from nrp_jax.planners.restarts import search_with_restarts
 from nrp_jax.scene.configurations import check_configuration
 from nrp_jax.scene.exact import ExactScene, verify
@@ -132,6 +134,7 @@ def plan(
             iterations = max((config.max_expansions - tried) // policy.lanes, 1)
             found, path = _searched(
                 planner,
+                robot,
                 world,
                 goal,
                 policy,
@@ -164,13 +167,20 @@ def plan(
 
 
 def _searched(
-    planner: str | ExpansionPolicy, world: GridWorld, goal: Any, policy: Any, tree: Any, **options
+    planner: str | ExpansionPolicy,
+    robot: MobileRobot,
+    world: GridWorld,
+    goal: Any,
+    policy: Any,
+    tree: Any,
+    **options: Any,
 ) -> tuple[SearchResult, np.ndarray | None]:
     """What a planner finds, and the path (P, D) if there is one."""
-    if planner == "nrp-star-connect":
-        return search_with_restarts(world, goal, policy, tree, **options)
-    grow = search_connect if isinstance(policy, NRPConnect) else search
-    found = grow(world, goal, policy, tree, **options)
+    if isinstance(policy, NRPConnect):
+        again = planner == "nrp-star-connect"
+        grow = search_with_restarts if again else search_by_drive
+        return grow(world, goal, policy, tree, folded=folded_postures(robot.name), **options)
+    found = search(world, goal, policy, tree, **options)
     return found, policy.extract_path(found.tree)
 
 

@@ -8,7 +8,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from nrp_jax.planners.nrp_connect import NRPConnect, search_connect
+from nrp_jax.planners.by_drive import search_by_drive
+from nrp_jax.planners.drive import Folded
+from nrp_jax.planners.nrp_connect import NRPConnect
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.search import SearchResult, StopReason, Termination
@@ -24,6 +26,7 @@ def search_with_restarts(
     policy: NRPConnect,
     tree: Tree,
     *,
+    folded: Folded | None = None,
     key: jax.Array,
     termination: Termination,
     time_limit_s: float,
@@ -36,6 +39,7 @@ def search_with_restarts(
         goal: where to.
         policy: the planner.
         tree: from ``policy.init``; every search begins with it.
+        folded: postures of the first search, which is by drive; None to do without.
         key: random key.
         termination: of all searches together; they go on after the goal is reached.
         time_limit_s: wall time of searches and shortcuts without compilation [s].
@@ -51,11 +55,12 @@ def search_with_restarts(
     history = np.zeros((0, 6))
     for attempt in itertools.count():
         left = np.int32(int(termination.max_iterations) - iterations)
-        found = search_connect(
+        found, raw = search_by_drive(
             world,
             goal,
             policy,
             tree,
+            folded=None if attempt else folded,
             key=jax.random.fold_in(key, attempt),
             termination=dataclasses.replace(termination, max_iterations=left),
             time_limit_s=time_limit_s - seconds,
@@ -68,7 +73,6 @@ def search_with_restarts(
         rows[:, COST] = np.minimum(rows[:, COST], cost)
         iterations, seconds = iterations + int(found.tree.iteration), seconds + found.search_s
         nodes, compile_s = nodes + int(found.tree.size), compile_s + found.compile_s
-        raw = policy.extract_path(found.tree)
         if raw is not None:
             started = time.perf_counter()
             short = shortcut(finer, raw, key=jax.random.fold_in(key, attempt))
