@@ -24,6 +24,7 @@ FD_STEP = 2e-4  # [rad] step of the finite differences; longer ones lose the wea
 RIDGE = 1e-7  # keeps joints that no pixel sees where they are
 MAX_STEP = 0.3  # [rad] of one step of a joint
 DAMPING = 1e-3  # at first, in units of the diagonal
+NEAR_DAMPING = 1e-4  # the same near a minimum, where weak directions are to be followed too
 LESS, MORE = 0.3, 4.0  # times as much damping after a step that lowers the cost, and after others
 PAYS = 0.01  # share of the cost; steps that save less are idle
 IDLE_STEPS = 2  # in a row, after which a configuration is left
@@ -197,7 +198,7 @@ def settle(
         now = jax.tree.map(lambda a, b: jnp.where(better, a, b), tried, now)
         return now, damping * jnp.where(better, LESS, MORE), idle, step + 1
 
-    first = place(q, seen), jnp.float32(DAMPING), jnp.int32(0), jnp.int32(0)
+    first = place(q, seen), jnp.float32(NEAR_DAMPING), jnp.int32(0), jnp.int32(0)
     (q, loss, cost, slope), *_ = jax.lax.while_loop(goes_on, try_step, first)
     return q, loss, cost, slope, matrix, world.is_free(q)
 
