@@ -12,7 +12,8 @@ import numpy as np
 from nrp_jax.config import PlannerConfig
 from nrp_jax.homes.grid import Grid
 from nrp_jax.homes.top_view import TopView
-from nrp_jax.planners.by_name import PLANNERS, policy_of
+from nrp_jax.planners.by_name import DECOMPOSED, PLANNERS, policy_of
+from nrp_jax.planners.decomposed import search_decomposed, shortcut_legs
 from nrp_jax.planners.nrp_connect import NRPConnect, default_planner, search_connect
 from nrp_jax.planners.restarts import search_with_restarts
 from nrp_jax.scene.configurations import check_configuration
@@ -30,6 +31,7 @@ from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import STATUS_OF, PlanResult, Status
 from vrrt_jax.core.search import SearchResult, make_termination, no_search, search
 from vrrt_jax.core.settings import check_settings
+from vrrt_jax.core.shortcut import shortcut
 from vrrt_jax.core.types import ExpansionPolicy
 
 ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
@@ -117,6 +119,7 @@ def plan(
     if policy.goal_score(goal) == -np.inf:
         world = dataclasses.replace(world, resolution=world.resolution / 2)
     tree = policy.init(world, goal, np.asarray(start)[None], config.capacity)
+    shorten = shortcut_legs if planner == DECOMPOSED else shortcut
     scene = scene or ExactScene(robot, grid)
     if starts_at(goal, world, start):
         found = no_search(policy, goal, tree)
@@ -136,6 +139,7 @@ def plan(
                 goal,
                 policy,
                 tree,
+                places,
                 key=jax.random.fold_in(key, attempt),
                 termination=make_termination(policy.goal_score(goal), max_iterations=iterations),
                 time_limit_s=left_s,
@@ -144,7 +148,7 @@ def plan(
             )
             check_extracted_path(policy, path, np.asarray(start))
             raw = np.asarray(start)[None] if path is None else path
-            results.append(_finish(scene, world, places, goal, raw, found, key))
+            results.append(_finish(scene, world, places, goal, raw, found, key, shorten))
             tried += results[-1].expansions
             spent.update(results[-1].timing)
             rejected.update(results[-1].rejected)
@@ -164,9 +168,17 @@ def plan(
 
 
 def _searched(
-    planner: str | ExpansionPolicy, world: GridWorld, goal: Any, policy: Any, tree: Any, **options
+    planner: str | ExpansionPolicy,
+    world: Any,
+    goal: Any,
+    policy: Any,
+    tree: Any,
+    places: "_Places",
+    **options: Any,
 ) -> tuple[SearchResult, np.ndarray | None]:
     """What a planner finds, and the path (P, D) if there is one."""
+    if planner == DECOMPOSED:
+        return search_decomposed(world, goal, policy, tree, grid=places.local_grid(), **options)
     if planner == "nrp-star-connect":
         return search_with_restarts(world, goal, policy, tree, **options)
     grow = search_connect if isinstance(policy, NRPConnect) else search
@@ -181,6 +193,11 @@ class _Places:
     grid: Grid  # the map
     corner: np.ndarray  # (2,) of the map [m]
     start: np.ndarray  # (D,) as it was given
+
+    def local_grid(self) -> Grid:
+        """The map where the planners' own world has it."""
+        x, y = np.array(self.grid.origin[:2]) - self.corner
+        return dataclasses.replace(self.grid, origin=(float(x), float(y), self.grid.origin[2]))
 
     def of(self, q: np.ndarray) -> np.ndarray:
         """Configurations (..., D) in the map."""
@@ -239,6 +256,7 @@ def _finish(
     raw: np.ndarray,
     found: SearchResult,
     key: jax.Array,
+    shorten: Callable[..., np.ndarray] = shortcut,
 ) -> PlanResult:
     """Shorten and verify what a search found, ``raw`` (P, D)."""
     loss, threshold = float(goal.loss(world, jnp.asarray(raw[-1]))), float(goal.threshold)
@@ -253,7 +271,7 @@ def _finish(
 
     if loss <= threshold:
         finer = dataclasses.replace(world, resolution=world.resolution / 2)
-        done = postprocess(finer, raw, check, key=key)
+        done = postprocess(finer, raw, check, key=key, shorten=shorten)
         status = Status.SOLVED if done.is_verified else Status.NOT_VERIFIED
     else:
         done = unchecked(raw, trajectory_of(world, raw))
@@ -263,7 +281,7 @@ def _finish(
         found,
         done,
         status=status,
-        advice=ADVICE[status],
+        advice=found.advice or ADVICE[status],
         target=nearest_turn(world, np.asarray(goal.q), done.checked.path[-1]),
         loss=loss,
         match_threshold=threshold,

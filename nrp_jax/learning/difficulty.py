@@ -113,7 +113,7 @@ def long_queries(
     q, node = q[node >= 0], node[node >= 0]
     # Random starts, each with a random goal that is far along the floor but can be reached.
     rng = np.random.default_rng(seed)
-    graph, pairs = _floor_graph(index, grid.resolution), []
+    graph, pairs = floor_graph(index, grid.resolution), []
     for start in rng.integers(0, len(q), 20 * num) if len(q) else ():
         geodesic = csgraph.dijkstra(graph, indices=node[start])[node]
         far = np.flatnonzero((geodesic >= MIN_GEODESIC) & np.isfinite(geodesic))
@@ -128,7 +128,7 @@ def long_queries(
     )
 
 
-def _floor_graph(index: np.ndarray, resolution: float) -> sparse.csr_matrix:
+def floor_graph(index: np.ndarray, resolution: float) -> sparse.csr_matrix:
     """Lengths [m] of steps from floor cells to their eight neighbors, a graph.
 
     Args:

@@ -18,12 +18,14 @@ from vrrt_jax.core.planners import RRT, BITStar, InformedRRTStar, RRTConnect, RR
 from vrrt_jax.core.types import ExpansionPolicy
 
 CONNECT = ("nrp-connect", "nrp-star-connect")
+DECOMPOSED = "decomposed"
 # Those of the last two rows go on to improve their paths until the budget ends.
 PLANNERS = (
     *("rrt", "rrt-is", "rrt-connect", "cvae-rrt", "nrp-d", "nrp-g", "nrp-connect"),
     *("rrt-star", "irrt-star", "bit-star", "cvae-irrt-star"),
-    *("nrp-star-d", "nrp-star-g", "nrp-star-connect"),
+    *("nrp-star-d", "nrp-star-g", "nrp-star-connect", DECOMPOSED),
 )
+FETCH_ONLY = (DECOMPOSED,)  # the paper has them for the Fetch alone
 # Of the samplers that planners need.
 KINDS = {
     "cvae-rrt": GLOBAL_CVAE,
@@ -44,6 +46,24 @@ REWIRING = {
 }
 
 
+def planners_of(task: str) -> tuple[str, ...]:
+    """The names of all planners that a robot has."""
+    return tuple(name for name in PLANNERS if task == "fetch" or name not in FETCH_ONLY)
+
+
+def check_names(task: str, text: str | None) -> tuple[str, ...]:
+    """The planners in a text such as "rrt,bit-star", each once; all of a robot's if it is None.
+
+    Raises:
+        ValueError: the robot has no such planner.
+    """
+    known = planners_of(task)
+    names = tuple(dict.fromkeys(text.split(","))) if text else known
+    if unknown := [name for name in names if name not in known]:
+        raise ValueError(f"unknown planner '{unknown[0]}'; have: {', '.join(known)}")
+    return names
+
+
 def policy_of(
     planner: str | ExpansionPolicy,
     robot: MobileRobot,
@@ -61,10 +81,13 @@ def policy_of(
         config: settings.
 
     Raises:
-        ValueError: the sampler does not fit.
+        ValueError: the sampler does not fit, or the planner is for another robot.
     """
     if not isinstance(planner, str):
         return planner
+    if planner not in planners_of(robot.name):
+        names = ", ".join(planners_of(robot.name))
+        raise ValueError(f"planner '{planner}' is for the fetch; '{robot.name}' has: {names}")
     if planner == "rrt-connect":
         return RRTConnect(lanes=max(config.lanes, 2))
     bias = jnp.float32(config.goal_bias)
@@ -73,7 +96,7 @@ def policy_of(
         return RRT(goal_bias=bias, intermediate=planner == "rrt-is", **shape)
     if planner == "bit-star":
         return BITStar(lanes=config.lanes, edge_steps=EDGE_STEPS)
-    if planner in ("rrt-star", "irrt-star"):
+    if planner in ("rrt-star", "irrt-star", DECOMPOSED):
         make = RRTStar if planner == "rrt-star" else InformedRRTStar
         return make(goal_bias=bias, **shape, **REWIRING)
     # The others have learned samplers.
