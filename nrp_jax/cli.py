@@ -52,9 +52,10 @@ def _add_plan(commands) -> None:
     plan.add_argument("--goal", type=command.numbers, help="as --goal=...")
     plan.add_argument(
         "--method",
-        help="nrp-connect (default), rrt, rrt-is, rrt-connect, cvae-rrt, nrp-d or nrp-g; or, to "
-        "shorten the path until the budget ends, bit-star, rrt-star, irrt-star, cvae-irrt-star, "
-        "nrp-star-d, nrp-star-g, nrp-star-connect or (Fetch) decomposed",
+        help="nrp-connect (default), rrt, rrt-is, rrt-connect, cvae-rrt, nrp-d, nrp-g or, of the "
+        "fetch, fire; or, to shorten the path until the budget ends, bit-star, rrt-star, "
+        "irrt-star, cvae-irrt-star, nrp-star-d, nrp-star-g, nrp-star-connect or, of the fetch, "
+        "fire-star or decomposed",
     )
     plan.add_argument("--model", help="what nrp train wrote; packaged weights by default")
     plan.add_argument("--crop", type=command.numbers, help="plan in x0,y0,x1,y1 of the map [m]")

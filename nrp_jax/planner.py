@@ -85,7 +85,9 @@ def plan(
         method: another word for ``planner``.
         sampler: what proposes waypoints to the "nrp-" planners: a pytree with ``propose(world,
             q_from, q_goal, key)``. For the "cvae-" planners, what draws samples: a pytree with
-            ``draw(world, q_start, q_goal, num, key)``. The packaged weights by default.
+            ``draw(world, q_start, q_goal, num, key)``; for "fire" and "fire-star", what has
+            ``retrieve(world, q_start, q_goal)``, which returns such a one. The packaged weights by
+            default.
         world: of this robot and grid, to save building it again; its ``is_free`` is obeyed.
         scene: the exact scene of this robot and grid, to save building it again.
         config: settings, the default ones if None.
@@ -108,7 +110,7 @@ def plan(
     places = _Places(grid=grid, corner=corner, start=q_start)
     start, goal_q = (jnp.asarray(shifted(q, -corner), jnp.float32) for q in (q_start, q_goal))
     goal = dataclasses.replace(goal, q=goal_q)
-    policy = policy_of(planner, robot, world, sampler, config)
+    policy = policy_of(planner, robot, world, sampler, config, (start, goal_q))
     if config.capacity < policy.lanes + 2:
         raise ValueError(
             f"capacity is {config.capacity}; expected at least {policy.lanes + 2}, two more than "

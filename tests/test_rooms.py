@@ -27,7 +27,7 @@ NRP_ROOMS = (
     ("homes",),
     ("scene",),
     ("learning",),
-    ("samplers", "generators"),
+    ("samplers", "generators", "retrieval"),
     ("planners",),
     ("planner", "problems"),
     ("viz", "viewer"),

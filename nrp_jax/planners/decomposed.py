@@ -16,6 +16,7 @@ from nrp_jax.homes.grid import Grid
 from nrp_jax.planners.hybrid_astar import drive
 from nrp_jax.scene.car_world import CarWorld
 from nrp_jax.scene.grid_world import GridWorld
+from nrp_jax.scene.world import batch_is_free
 from vrrt_jax.core.edges import Space
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners.informed_rrt_star import InformedRRTStar
@@ -74,8 +75,9 @@ def search_decomposed(
     start, end = np.asarray(tree.q[0]), np.asarray(goal.q, np.float32)
     rest_start, rest_end = (np.append(q[:BASE], REST).astype(np.float32) for q in (start, end))
     nothing = no_search(policy, goal, tree)
-    for place, q in (("start", rest_start), ("goal", rest_end)):
-        if not bool(jax.jit(world.is_free)(jnp.asarray(q))):
+    is_free = np.asarray(batch_is_free(world, jnp.asarray([rest_start, rest_end])))
+    for place, free in zip(("start", "goal"), is_free, strict=True):
+        if not free:
             advice = f"the arm cannot rest at the {place}, where its rest pose touches something"
             return dataclasses.replace(nothing, advice=f"{advice}: {ELSEWHERE}"), None
     way = drive(world, grid, rest_start, rest_end, time_limit_s=time_limit_s)
@@ -106,7 +108,7 @@ def search_decomposed(
                 leg.found.tree,
                 key=jax.random.fold_in(key, index),
                 termination=half,
-                time_limit_s=TURN_S,
+                time_limit_s=min(TURN_S, time_limit_s - seconds),
                 **options,
             )
             for row in found.history[1:]:  # meanwhile the other leg waits
