@@ -11,6 +11,7 @@ from nrp_jax.learning.experience_database import Database
 from nrp_jax.learning.similarity import LATENT, MARGIN, Siamese
 from nrp_jax.planner import plan
 from nrp_jax.planners.by_name import policy_of
+from nrp_jax.planners.cvae import CVAERRT, CVAEInformedRRTStar
 from nrp_jax.retrieval import SIGMA, UNIFORM_SHARE, ExperienceSampler, Mixture
 from nrp_jax.samplers import load_sampler
 
@@ -64,15 +65,17 @@ def test_samples_are_around_the_means_and_inside_the_limits(home):
     assert uniform[:, 0].std() > 2 * SIGMA and len(np.unique(uniform, axis=0)) == 2000
 
 
-@pytest.mark.parametrize("planner", ["fire", "fire-star"])
-def test_planners_draw_from_what_is_retrieved(home, database, planner):
+def test_planners_draw_from_what_is_retrieved(home, database):
     robot, _, world = home
     sampler, config = ExperienceSampler(robot, database), PlannerConfig(lanes=64)
     start, goal = ((q + [10, 20, *[0] * 9]).astype(np.float32) for q in (START, GOAL))
-    policy = policy_of(planner, robot, world, sampler, config, (start, goal))
+    star = policy_of("fire-star", robot, world, sampler, config, (start, goal))
+    assert isinstance(star, CVAEInformedRRTStar) and isinstance(star.sampler, Mixture)
+    policy = policy_of("fire", robot, world, sampler, config, (start, goal))
+    assert isinstance(policy, CVAERRT)
     to = nrp_jax.ConfigurationGoal(q=jnp.asarray(goal))
     tree = policy.init(world, to, start[None], 128)
-    q = np.asarray(policy.sample(world, to, tree, jax.random.key(0)))
+    q = np.asarray(jax.jit(CVAERRT.sample)(policy, world, to, tree, jax.random.key(0)))
     from_mixture = np.abs(q[:, 3:] - REST).max(axis=1) < 5 * SIGMA
     assert from_mixture.mean() == pytest.approx(1 - UNIFORM_SHARE, abs=0.15)
 

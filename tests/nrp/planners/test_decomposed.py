@@ -3,7 +3,6 @@
 import json
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -15,7 +14,9 @@ from nrp_jax.planners.decomposed import BASE, REST
 from nrp_jax.planners.hybrid_astar import STEP, drive
 from nrp_jax.scene.car_world import CarWorld
 from nrp_jax.scene.exact import ExactScene
+from nrp_jax.scene.trajectory import trajectory_of
 from vrrt_jax.core.interrupt import interruptible
+from vrrt_jax.core.shortcut import path_length
 
 pytestmark = pytest.mark.light_compilation
 # A wall across the room, with a door of 0.9 m.
@@ -56,16 +57,10 @@ def test_the_base_drives_through_the_door(homes, way):
     np.testing.assert_allclose(way.path[[0, -1]], [START, GOAL], atol=1e-6)
     assert way.checked > 0 and not way.is_over and way.search_s > 0
     # Motions are 0.5 m long, as the world itself drives them; the last edge is what is left.
-    lengths = np.asarray(world.distance(jnp.asarray(way.path[:-1]), jnp.asarray(way.path[1:])))
-    np.testing.assert_allclose(lengths[:-1], STEP, atol=1e-3)
+    motions = way.path[:-1]
+    assert path_length(world, motions) == pytest.approx(STEP * (len(motions) - 1), abs=1e-3)
     # The disc of 0.3 m keeps away from all that is below 1.1 m.
-    share = np.linspace(0, 1, 50, dtype=np.float32)
-    along = np.concatenate(
-        [
-            world.interpolate(jnp.tile(a, (50, 1)), jnp.tile(b, (50, 1)), share)
-            for a, b in zip(way.path[:-1], way.path[1:], strict=True)
-        ]
-    )
+    along = trajectory_of(world, way.path)
     solid = np.argwhere(grid.occupied.any(axis=2)) * 0.1
     gap = np.maximum(np.maximum(solid - along[:, None, :2], along[:, None, :2] - solid - 0.1), 0)
     assert np.linalg.norm(gap, axis=-1).min() > hybrid_astar.RADIUS - 1e-3
@@ -155,11 +150,7 @@ def test_it_is_for_the_fetch():
         plan(snake, floor, q, q, key=jax.random.key(0), planner="decomposed")
 
 
-def test_the_rest_pose_is_free_of_the_robot_itself(fetch):
-    grid = nrp_jax.Grid(occupied=np.zeros((20, 20, 20), bool))
-    for heading in (0.0, 2.0):
-        q = np.array([1.0, 1.0, heading, *REST])
-        assert ExactScene(fetch, grid).touching(q) == []
-        nearest = nrp_jax.nearest_free(fetch, nrp_jax.build_world(fetch, grid), q)
-        assert nearest is not None
-        np.testing.assert_allclose(nearest, q, atol=1e-5)
+def test_the_rest_pose_is_free_of_the_robot_itself(homes):
+    _, world, scene = homes["open"]
+    assert scene.touching(START) == [] and scene.touching(GOAL) == []
+    assert np.all(nrp_jax.batch_is_free(world, np.float32([START, GOAL])))

@@ -1,6 +1,5 @@
 """Odometry of a path: integrated, it leads along the path again."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -12,7 +11,7 @@ pytestmark = pytest.mark.light_compilation
 
 @pytest.fixture(scope="module")
 def world():
-    grid = nrp_jax.Grid(occupied=np.zeros((60, 60, 20), bool), origin=(100.0, -50.0, 0.0))
+    grid = nrp_jax.Grid(occupied=np.zeros((40, 40, 20), bool), origin=(100.0, -50.0, 0.0))
     return nrp_jax.build_world(nrp_jax.load_robot("fetch"), grid)
 
 
@@ -20,7 +19,7 @@ def test_wheels_and_motors_lead_along_the_path(world):
     rng = np.random.default_rng(0)
     path = np.concatenate(
         [
-            rng.uniform([101, -49, -3], [105, -45, 3], (6, 3)),
+            rng.uniform([101, -49, -3], [103, -47, 3], (6, 3)),
             rng.uniform(0.05, 0.3, (6, 1)),
             rng.uniform(-1, 1, (6, 7)),
         ],
@@ -38,13 +37,8 @@ def test_wheels_and_motors_lead_along_the_path(world):
     np.testing.assert_allclose([x, y], path[-1, :2], atol=1e-3)
     wrapped = np.angle(np.exp(1j * (numbers[-1, 1:] - path[-1, 2:])))
     np.testing.assert_allclose(wrapped, 0, atol=1e-4)
-    driven = np.abs(np.diff(numbers[:, 0])).sum()
-    inner = jnp.asarray(path - [100, -50, *[0] * 9], jnp.float32)
-    arm = jnp.linalg.norm(jnp.diff(inner[:, 3:], axis=0), axis=1)
-    costs = world.distance(inner[:-1], inner[1:]) - world.arm_weight * arm
-    assert driven == pytest.approx(float(costs.sum()), rel=1e-3)
 
 
 def test_a_path_of_one_waypoint_stays(world):
-    q = np.array([103.0, -47.0, 1.0, 0.1, 0, 0, 0, 0, 0, 0, 0])
+    q = np.array([102.0, -48.0, 1.0, 0.1, 0, 0, 0, 0, 0, 0, 0])
     np.testing.assert_allclose(odometry(world, q[None]), [[0, *q[2:]]])
