@@ -1,6 +1,5 @@
 """FIRE's experiences: parts and entries by hand, a network that learns, and files."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from nrp_jax.cli import main
 from nrp_jax.homes.grid import Grid
 from nrp_jax.learning.data import Dataset
 from nrp_jax.learning.experience_database import load_database
-from nrp_jax.learning.experiences import make_experience_rows
 from nrp_jax.learning.primitives import (
     SIDE,
     STRIDE,
@@ -21,7 +19,6 @@ from nrp_jax.learning.primitives import (
     middles,
     query_features,
 )
-from nrp_jax.learning.roadmap import build_roadmap
 from nrp_jax.learning.shards import DatasetSettings
 from nrp_jax.learning.similarity import (
     LATENT,
@@ -171,22 +168,6 @@ def test_a_training_goes_on_and_its_database_is_read(fetch, dataset, entries, tm
     weights = nrp_jax.samplers.__file__.replace("samplers.py", "weights/fetch_cvae.npz")
     with pytest.raises(ValueError, match="not a readable database of this version; make it again"):
         load_database(weights, "fetch")
-
-
-def test_experiences_are_corners_of_shortened_paths():
-    snake = nrp_jax.load_robot("snake")
-    occupied = np.zeros((40, 40), bool)
-    occupied[18:21, :28] = True
-    world = build_world(snake, Grid(occupied=occupied))
-    roadmap = build_roadmap(world, snake, jax.random.key(0), 500)
-    rows = make_experience_rows(world, snake, roadmap, np.random.default_rng(0), 10, 3)
-    assert 0 < len(rows.query) and np.bincount(rows.query).max() <= 3
-    assert np.asarray(batch_is_free(world, jnp.asarray(rows.waypoint))).all()
-    assert np.all(rows.ratio == 1) and rows.waypoint.shape == rows.optimal.shape
-    straight = np.asarray(world.distance(jnp.asarray(rows.q_start), jnp.asarray(rows.q_goal)))
-    through = [(rows.q_start, rows.waypoint), (rows.waypoint, rows.q_goal)]
-    least = sum(np.asarray(world.distance(jnp.asarray(a), jnp.asarray(b))) for a, b in through)
-    assert np.all(rows.length >= least - 1e-3) and np.all(least >= straight - 1e-4)
 
 
 def test_other_data_are_refused(tmp_path, capsys):

@@ -153,4 +153,4 @@ def test_it_is_for_the_fetch():
 def test_the_rest_pose_is_free_of_the_robot_itself(homes):
     _, world, scene = homes["open"]
     assert scene.touching(START) == [] and scene.touching(GOAL) == []
-    assert np.all(nrp_jax.batch_is_free(world, np.float32([START, GOAL])))
+    assert np.all(nrp_jax.batch_is_free(world, np.array([START, GOAL], np.float32)))
