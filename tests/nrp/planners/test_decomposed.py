@@ -110,7 +110,7 @@ def test_its_path_is_timed_by_the_command(homes, tmp_path, capsys):
     homes["open"][0].save(tmp_path / "home.npz")
     poses = {name: [*q[:BASE], *STRETCHED] for name, q in (("a", START), ("b", GOAL))}
     (tmp_path / "poses.json").write_text(json.dumps(poses))
-    command = ["bench", "execution", "--homes", str(tmp_path / "home.npz"), "--budget", "2"]
+    command = ["bench", "execution", "--homes", str(tmp_path / "home.npz"), "--budget", "3"]
     command += ["--lanes", "8", "--poses", str(tmp_path / "poses.json")]
     command += ["--json", str(tmp_path / "out.json"), "--planners", "decomposed"]
     assert main(command) == 0
