@@ -18,7 +18,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from nrp_jax.bench import checks, curves, planning, report, score
+    from nrp_jax.bench import checks, curves, execution, planning, report, score
     from nrp_jax.homes import figure
     from nrp_jax.learning import data, train
 
@@ -35,7 +35,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_port(view)
     bench = commands.add_parser("bench", help="measure speed and success")
     benches = bench.add_subparsers(dest="what", required=True)
-    for module in (checks, planning, curves):
+    for module in (checks, planning, curves, execution):
         module.add_arguments(benches)
     return parser
 
@@ -52,9 +52,10 @@ def _add_plan(commands) -> None:
     plan.add_argument("--goal", type=command.numbers, help="as --goal=...")
     plan.add_argument(
         "--method",
-        help="nrp-connect (default), rrt, rrt-is, rrt-connect, cvae-rrt, nrp-d or nrp-g; or, to "
-        "shorten the path until the budget ends, bit-star, rrt-star, irrt-star, cvae-irrt-star, "
-        "nrp-star-d, nrp-star-g or nrp-star-connect",
+        help="nrp-connect (default), rrt, rrt-is, rrt-connect, cvae-rrt, nrp-d, nrp-g or, of the "
+        "fetch, fire; or, to shorten the path until the budget ends, bit-star, rrt-star, "
+        "irrt-star, cvae-irrt-star, nrp-star-d, nrp-star-g, nrp-star-connect or, of the fetch, "
+        "fire-star or decomposed",
     )
     plan.add_argument("--model", help="what nrp train wrote; packaged weights by default")
     plan.add_argument("--crop", type=command.numbers, help="plan in x0,y0,x1,y1 of the map [m]")

@@ -13,7 +13,8 @@ from nrp_jax.config import PlannerConfig
 from nrp_jax.homes.grid import Grid
 from nrp_jax.homes.top_view import TopView
 from nrp_jax.planners.by_drive import search_by_drive
-from nrp_jax.planners.by_name import PLANNERS, policy_of
+from nrp_jax.planners.by_name import DECOMPOSED, PLANNERS, policy_of
+from nrp_jax.planners.decomposed import search_decomposed, shortcut_legs
 from nrp_jax.planners.drive import folded_postures
 from nrp_jax.planners.nrp_connect import NRPConnect, default_planner
 from nrp_jax.planners.restarts import search_with_restarts
@@ -32,6 +33,7 @@ from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import STATUS_OF, PlanResult, Status
 from vrrt_jax.core.search import SearchResult, make_termination, no_search, search
 from vrrt_jax.core.settings import check_settings
+from vrrt_jax.core.shortcut import shortcut
 from vrrt_jax.core.types import ExpansionPolicy
 
 ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
@@ -85,7 +87,9 @@ def plan(
         method: another word for ``planner``.
         sampler: what proposes waypoints to the "nrp-" planners: a pytree with ``propose(world,
             q_from, q_goal, key)``. For the "cvae-" planners, what draws samples: a pytree with
-            ``draw(world, q_start, q_goal, num, key)``. The packaged weights by default.
+            ``draw(world, q_start, q_goal, num, key)``; for "fire" and "fire-star", what has
+            ``retrieve(world, q_start, q_goal)``, which returns such a one. The packaged weights by
+            default.
         world: of this robot and grid, to save building it again; its ``is_free`` is obeyed.
         scene: the exact scene of this robot and grid, to save building it again.
         config: settings, the default ones if None.
@@ -108,7 +112,7 @@ def plan(
     places = _Places(grid=grid, corner=corner, start=q_start)
     start, goal_q = (jnp.asarray(shifted(q, -corner), jnp.float32) for q in (q_start, q_goal))
     goal = dataclasses.replace(goal, q=goal_q)
-    policy = policy_of(planner, robot, world, sampler, config)
+    policy = policy_of(planner, robot, world, sampler, config, (start, goal_q))
     if config.capacity < policy.lanes + 2:
         raise ValueError(
             f"capacity is {config.capacity}; expected at least {policy.lanes + 2}, two more than "
@@ -119,6 +123,7 @@ def plan(
     if policy.goal_score(goal) == -np.inf:
         world = dataclasses.replace(world, resolution=world.resolution / 2)
     tree = policy.init(world, goal, np.asarray(start)[None], config.capacity)
+    shorten = shortcut_legs if planner == DECOMPOSED else shortcut
     scene = scene or ExactScene(robot, grid)
     if starts_at(goal, world, start):
         found = no_search(policy, goal, tree)
@@ -139,6 +144,7 @@ def plan(
                 goal,
                 policy,
                 tree,
+                places,
                 key=jax.random.fold_in(key, attempt),
                 termination=make_termination(policy.goal_score(goal), max_iterations=iterations),
                 time_limit_s=left_s,
@@ -147,7 +153,7 @@ def plan(
             )
             check_extracted_path(policy, path, np.asarray(start))
             raw = np.asarray(start)[None] if path is None else path
-            results.append(_finish(scene, world, places, goal, raw, found, key))
+            results.append(_finish(scene, world, places, goal, raw, found, key, shorten))
             tried += results[-1].expansions
             spent.update(results[-1].timing)
             rejected.update(results[-1].rejected)
@@ -173,9 +179,12 @@ def _searched(
     goal: Any,
     policy: Any,
     tree: Any,
+    places: "_Places",
     **options: Any,
 ) -> tuple[SearchResult, np.ndarray | None]:
     """What a planner finds, and the path (P, D) if there is one."""
+    if planner == DECOMPOSED:
+        return search_decomposed(world, goal, policy, tree, grid=places.local_grid(), **options)
     if isinstance(policy, NRPConnect):
         again = planner == "nrp-star-connect"
         grow = search_with_restarts if again else search_by_drive
@@ -191,6 +200,11 @@ class _Places:
     grid: Grid  # the map
     corner: np.ndarray  # (2,) of the map [m]
     start: np.ndarray  # (D,) as it was given
+
+    def local_grid(self) -> Grid:
+        """The map where the planners' own world has it."""
+        x, y = np.array(self.grid.origin[:2]) - self.corner
+        return dataclasses.replace(self.grid, origin=(float(x), float(y), self.grid.origin[2]))
 
     def of(self, q: np.ndarray) -> np.ndarray:
         """Configurations (..., D) in the map."""
@@ -249,6 +263,7 @@ def _finish(
     raw: np.ndarray,
     found: SearchResult,
     key: jax.Array,
+    shorten: Callable[..., np.ndarray] = shortcut,
 ) -> PlanResult:
     """Shorten and verify what a search found, ``raw`` (P, D)."""
     loss, threshold = float(goal.loss(world, jnp.asarray(raw[-1]))), float(goal.threshold)
@@ -263,7 +278,7 @@ def _finish(
 
     if loss <= threshold:
         finer = dataclasses.replace(world, resolution=world.resolution / 2)
-        done = postprocess(finer, raw, check, key=key)
+        done = postprocess(finer, raw, check, key=key, shorten=shorten)
         status = Status.SOLVED if done.is_verified else Status.NOT_VERIFIED
     else:
         done = unchecked(raw, trajectory_of(world, raw))
@@ -273,7 +288,7 @@ def _finish(
         found,
         done,
         status=status,
-        advice=ADVICE[status],
+        advice=found.advice or ADVICE[status],
         target=nearest_turn(world, np.asarray(goal.q), done.checked.path[-1]),
         loss=loss,
         match_threshold=threshold,

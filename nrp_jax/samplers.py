@@ -20,9 +20,11 @@ from nrp_jax.learning import features
 from nrp_jax.learning.batches import describe, read_image, relations
 from nrp_jax.learning.checkpoint import Model, build_module, check_model, load_model
 from nrp_jax.learning.edge_check import first_free
+from nrp_jax.learning.experience_database import load_database
 from nrp_jax.learning.local_map import SIDE
-from nrp_jax.learning.models import GLOBAL_CVAE, ModelConfig, check_choices
+from nrp_jax.learning.models import FIRE, GLOBAL_CVAE, ModelConfig, check_choices
 from nrp_jax.learning.network_inputs import NetworkInputs, network_inputs
+from nrp_jax.retrieval import ExperienceSampler
 from nrp_jax.scene.robots import MobileRobot, batch_link_features, load_robot
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.edges import difference, enforce_bounds
@@ -197,25 +199,33 @@ def make_sampler(model: Model, **settings: Any) -> Any:
     return make(num_outputs=model.info["num_outputs"], **shared)
 
 
+def packaged_file(task: str, kind: str) -> Path:
+    """Where the packaged weights of a kind are, if there are any."""
+    return Path(__file__).parent / "weights" / f"{task}_{kind}.npz"
+
+
 @single_precision
 def load_sampler(task: str, kind: str, path: str | Path | None = None, **settings: Any) -> Any:
     """Load a sampler's weights.
 
     Args:
         task: "snake" or "fetch".
-        kind: "discriminator", "cvae" or "global-cvae".
+        kind: "discriminator", "cvae", "global-cvae" or "fire".
         path: a folder that ``nrp train`` wrote, or the ``model.npz`` in it; the packaged weights
             if None.
         settings: fields of the sampler's class, such as ``num_edge_checked``.
 
     Returns:
-        A :class:`DiscriminatorSampler`, :class:`CVAESampler` or :class:`GlobalCVAESampler`.
+        A :class:`DiscriminatorSampler`, :class:`CVAESampler`, :class:`GlobalCVAESampler` or
+        :class:`ExperienceSampler`.
 
     Raises:
         ValueError: there is no such model, or it is for another task or of another kind.
     """
+    path = packaged_file(task, kind) if path is None else Path(path)
+    if kind == FIRE:
+        return ExperienceSampler(load_robot(task), load_database(path, task), **settings)
     check_choices(task, kind)
-    path = Path(__file__).parent / "weights" / f"{task}_{kind}.npz" if path is None else Path(path)
     model = load_model(path)
     check_model(model, path, task=task, kind=kind)
     return make_sampler(model, **settings)
@@ -229,14 +239,14 @@ def check_fits(sampler: Any, robot: MobileRobot, world: GridWorld, kind: str) ->
         sampler: any sampler; of other classes only the method that planners call is checked.
         robot: to plan for.
         world: the robot in a home.
-        kind: "discriminator", "cvae" or "global-cvae", which the planner needs.
+        kind: "discriminator", "cvae", "global-cvae" or "fire", which the planner needs.
 
     Raises:
         ValueError: the sampler is of another task or kind, or the map's cells are others than those
             that the networks were trained on, or more than a network of whole maps can see.
     """
-    if not isinstance(sampler, DiscriminatorSampler | Generator):
-        method = "draw" if kind == GLOBAL_CVAE else "propose"
+    if not isinstance(sampler, DiscriminatorSampler | Generator | ExperienceSampler):
+        method = {GLOBAL_CVAE: "draw", FIRE: "retrieve"}.get(kind, "propose")
         if not hasattr(sampler, method):
             raise ValueError(
                 f"the sampler, a {type(sampler).__name__}, has no method {method}; expected one as "

@@ -78,6 +78,7 @@ def from_maps(
     queries: int,
     seed: int,
     poses: Mapping[str, np.ndarray] | None = None,
+    legs: bool = False,
 ) -> list[QueryHome]:
     """The first maps in a folder, or one map, with long queries or all ordered pairs of poses.
 
@@ -88,6 +89,7 @@ def from_maps(
         queries: of a map, at most.
         seed: of long queries.
         poses: (D,) by name.
+        legs: only the pairs of a pose and the next one.
 
     Raises:
         ValueError: no map fits, or in none of them there is a query.
@@ -99,7 +101,7 @@ def from_maps(
             found.append(
                 _with_long_queries(robot, name, grid, queries, seed)
                 if poses is None
-                else _with_poses(robot, name, grid, poses, queries)
+                else _with_poses(robot, name, grid, poses, queries, legs)
             )
         except ValueError as error:
             print(f"map '{name}' is left out: {error}", file=sys.stderr)
@@ -172,9 +174,17 @@ def _with_long_queries(
 
 
 def _with_poses(
-    robot: MobileRobot, name: str, grid: Grid, poses: Mapping[str, np.ndarray], queries: int
+    robot: MobileRobot,
+    name: str,
+    grid: Grid,
+    poses: Mapping[str, np.ndarray],
+    queries: int,
+    legs: bool,
 ) -> QueryHome:
-    """All ordered pairs of poses; one that is refused is replaced by the nearest that is free."""
+    """All ordered pairs of poses, or ``legs`` from each to the next.
+
+    A pose that is refused is replaced by the nearest that is free.
+    """
     world = build_world(robot, grid)
     free, moved, refused = {}, {}, {}
     for pose, q in poses.items():
@@ -184,7 +194,8 @@ def _with_poses(
         elif problem:
             refused[pose] = problem
             del free[pose]
-    pairs = list(itertools.permutations(free, 2))[:queries]
+    ordered = itertools.pairwise(free) if legs else itertools.permutations(free, 2)
+    pairs = list(ordered)[:queries]
     if not pairs:
         raise ValueError(f"fewer than two poses are free: {'; '.join(refused.values())}")
     return QueryHome(

@@ -11,9 +11,11 @@ from scipy.sparse import csgraph
 
 from nrp_jax.bench import ompl_peers
 from nrp_jax.bench.curve_homes import QueryHome
+from nrp_jax.bench.execution_time import execution_time
 from nrp_jax.learning.edge_check import check_edges
 from nrp_jax.learning.roadmap import Extents, build_roadmap
 from nrp_jax.planner import PlanResult, plan
+from nrp_jax.scene.car_world import CarWorld
 from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.nearest import shifted, working_world
 from nrp_jax.scene.robots import MobileRobot, load_robot
@@ -58,7 +60,9 @@ def run_item(setting: Setting, item: Item) -> dict[str, Any]:
         * ``search_s``, ``expansions`` and ``checks`` that the whole search took, and
           ``refused``, the paths that the exact check refused;
         * ``steps``: a row ``[seconds, expansions, checks, cost]`` for each time that the best path
-          of the search became shorter, the first path included.
+          of the search became shorter, the first path included;
+        * of a Fetch's solved query ``execution_s``, see :func:`execution_time`, and ``stopping_s``,
+          the same with stops at all corners.
     """
     home = setting.homes[item.home]
     robot, scene, world = _built(setting.task, home)
@@ -94,7 +98,11 @@ def run_item(setting: Setting, item: Item) -> dict[str, Any]:
             max_expansions=ENDLESS,
             time_limit_s=setting.budget_s,
         )
-    return row | row_of(result)
+    row |= row_of(result)
+    if isinstance(world, CarWorld) and result.ok:
+        row["execution_s"] = round(execution_time(world, result.path), 3)
+        row["stopping_s"] = round(execution_time(world, result.path, tolerance=0.0), 3)
+    return row
 
 
 def row_of(result: PlanResult) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from nrp_jax.bench.curve_rows import ROADMAP, Item, Setting, run_item
 from nrp_jax.bench.curve_stats import NOTES, REFERENCE, curves, grid_to, references
 from nrp_jax.bench.curve_table import to_text
 from nrp_jax.homes.houses import CELLS
-from nrp_jax.planners.by_name import PLANNERS
+from nrp_jax.planners.by_name import check_names
 from nrp_jax.scene.robots import load_robot
 from vrrt_jax.core import command
 from vrrt_jax.core.peers import ompl_version
@@ -36,7 +36,7 @@ class CurveBenchmark:
     """What to measure; planners and runs can be added to rows that are there."""
 
     setting: Setting
-    planners: tuple[str, ...]  # of PLANNERS or ompl_peers.PEERS
+    planners: tuple[str, ...]  # of by_name.PLANNERS or ompl_peers.PEERS
     runs: int = 1
     jobs: int = 1
 
@@ -69,7 +69,7 @@ class CurveBenchmark:
 
 
 def run(benchmark: CurveBenchmark, file: Path | None) -> dict[str, Any]:
-    """Measure what is not in the file of rows yet.
+    """Measure what is not in the file of rows yet, and tell the curves.
 
     Args:
         benchmark: what to measure.
@@ -84,6 +84,17 @@ def run(benchmark: CurveBenchmark, file: Path | None) -> dict[str, Any]:
         ValueError: the rows are of another benchmark, version or seed.
         OSError: a file cannot be written; the rows that were written stay.
     """
+    header, rows = measure(benchmark, file)
+    results = summary(benchmark, header, rows)
+    if file is not None:
+        write(file, results)
+    return results
+
+
+def measure(
+    benchmark: CurveBenchmark, file: Path | None
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The header and all rows of a benchmark; arguments and errors are those of :func:`run`."""
     header, homes = benchmark.header(), benchmark.setting.homes
     rows_file = None if file is None else file.with_name(f"{file.name}.rows")
     rows = [] if rows_file is None else resume_rows(rows_file, header)
@@ -103,10 +114,7 @@ def run(benchmark: CurveBenchmark, file: Path | None) -> dict[str, Any]:
             won, tried = won + row.get("solved", 0), tried + ("solved" in row)
             bar.set_postfix_str(f"{100 * won / max(tried, 1):.0f} % solved")
             bar.update()
-    results = summary(benchmark, header, rows)
-    if file is not None:
-        write(file, results)
-    return results
+    return header, rows
 
 
 def summary(
@@ -147,7 +155,7 @@ def add_arguments(subparsers: Any) -> None:
     parser = subparsers.add_parser("curves", help="success and path optimality over time")
     parser.set_defaults(run=_run_command)
     parser.add_argument("--task", default="snake", choices=tuple(CELLS), help="whose queries")
-    parser.add_argument("--planners", default=",".join(PLANNERS), help="some of the default's")
+    parser.add_argument("--planners", help="names for nrp_jax.plan; all of the robot's by default")
     parser.add_argument("--peers", action="store_true", help="OMPL's planners too")
     parser.add_argument(
         "--homes", default="test", help="test for unseen random ones; or a folder of maps, or a map"
@@ -177,7 +185,7 @@ def add_arguments(subparsers: Any) -> None:
 
 
 def _run_command(arguments: argparse.Namespace) -> int:
-    planners = _planners(arguments.planners, arguments.peers)
+    planners = _planners(arguments.task, arguments.planners, arguments.peers)
     setting = Setting(
         homes=tuple(_homes(arguments)),
         budget_s=arguments.budget,
@@ -191,16 +199,14 @@ def _run_command(arguments: argparse.Namespace) -> int:
     return command.EXIT_SOLVED
 
 
-def _planners(text: str, peers: bool) -> tuple[str, ...]:
+def _planners(task: str, text: str | None, peers: bool) -> tuple[str, ...]:
     """The planners that are asked for, each once.
 
     Raises:
         ValueError: a name is unknown.
         ModuleNotFoundError: peers are asked for, and OMPL is not installed.
     """
-    names = tuple(dict.fromkeys(text.split(",")))
-    if unknown := [name for name in names if name not in PLANNERS]:
-        raise ValueError(f"unknown planner '{unknown[0]}'; have: {', '.join(PLANNERS)}")
+    names = check_names(task, text)
     if peers:
         ompl_version()
     return names + (ompl_peers.PEERS if peers else ())

@@ -14,7 +14,7 @@ from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning.difficulty import EXPANSIONS, MIN_GEODESIC, fair_house, long_queries
 from nrp_jax.learning.shards import DatasetSettings, home_seed
 from nrp_jax.planner import PlanResult, Status, plan
-from nrp_jax.planners.by_name import CONNECT, KINDS, PLANNERS
+from nrp_jax.planners.by_name import CONNECT, KINDS, check_names
 from nrp_jax.planners.nrp_connect import UNCHECKED
 from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.robots import MobileRobot, load_robot
@@ -125,7 +125,7 @@ def add_arguments(subparsers: Any) -> None:
     parser = subparsers.add_parser("plan", help="success on unseen homes at some expansions")
     parser.set_defaults(run=_run_command)
     parser.add_argument("--task", default="snake", choices=tuple(CELLS), help="whose homes")
-    parser.add_argument("--methods", default=",".join(PLANNERS), help="some of the default's")
+    parser.add_argument("--methods", help="names for nrp_jax.plan; all of the robot's by default")
     parser.add_argument("--homes", type=command.whole(1, 100_000), default=5, help="unseen ones")
     parser.add_argument("--queries", type=command.whole(1, 100_000), default=10, help="of a home")
     parser.add_argument(
@@ -140,6 +140,7 @@ def add_arguments(subparsers: Any) -> None:
     parser.add_argument("--discriminator", help="what nrp train wrote; packaged by default")
     parser.add_argument("--cvae", help="what nrp train wrote; packaged by default")
     parser.add_argument("--global-cvae", help="what nrp train wrote; packaged by default")
+    parser.add_argument("--fire", help="what nrp train wrote; packaged by default")
     parser.add_argument(
         "--seed", type=command.whole(0, 100_000), default=0, help="of the homes, as for nrp data"
     )
@@ -151,10 +152,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
 
     from nrp_jax.samplers import load_sampler
 
-    methods = arguments.methods.split(",")
-    unknown = [method for method in methods if method not in PLANNERS]
-    if unknown:
-        raise ValueError(f"unknown method '{unknown[0]}'; have: {', '.join(PLANNERS)}")
+    methods = check_names(arguments.task, arguments.methods)
     for name in ("homes", "queries", "max_expansions", "lanes"):
         if getattr(arguments, name) < 1:
             raise ValueError(f"{name} is {getattr(arguments, name)}; expected at least 1")

@@ -249,8 +249,12 @@ def add_arguments(subparsers) -> None:
     parser.add_argument(
         "--seed", type=command.whole(0, 100_000), default=0, help="of homes, roadmaps and rows"
     )
-    parser.add_argument(
+    kind = parser.add_mutually_exclusive_group()
+    kind.add_argument(
         "--paths", action="store_true", help="states along whole paths, for --model global-cvae"
+    )
+    kind.add_argument(
+        "--experiences", action="store_true", help="corners of shortened paths, for --model fire"
     )
     parser.add_argument(
         "--jobs", type=command.whole(1, 1024), default=usable_cores(), help="processes"
@@ -267,6 +271,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
         nodes=arguments.nodes,
         seed=arguments.seed,
         paths=arguments.paths,
+        experiences=arguments.experiences,
     )
     with tqdm(unit="home", disable=None) as bar:
 

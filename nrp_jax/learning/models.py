@@ -13,6 +13,7 @@ import jax.numpy as jnp
 GLOBAL_CVAE = "global-cvae"  # sees the whole map, and generates configurations along whole paths
 WAYPOINT_KINDS = ("discriminator", "cvae")
 KINDS = (*WAYPOINT_KINDS, GLOBAL_CVAE)
+FIRE = "fire"  # a database of experiences, see nrp_jax.learning.similarity
 TASKS = ("snake", "fetch")
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax.learning.edge_check import POINT_BATCH, pad_rows
-from nrp_jax.learning.expert import Rows, choose_start, shortest_paths
+from nrp_jax.learning.expert import Rows, ShortestPaths, choose_start, shortest_paths
 from nrp_jax.learning.roadmap import Extents, Roadmap
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld
@@ -41,16 +41,13 @@ def make_path_rows(
         Rows whose ``waypoint`` is a state and whose ``ratio`` is 1.
     """
     paths = shortest_paths(rng, roadmap, num_queries)
-    extents, num_nodes = Extents(robot, roadmap.q), len(roadmap.q)
+    extents = Extents(robot, roadmap.q)
     rows, ends, fractions = [], [], []
     for query in range(num_queries):
         g = paths.index_of(query)
-        goal, cost, step = paths.goals[g], paths.cost[g], paths.step[g]
-        near_goal = extents.inside(goal, slice(num_nodes))
-        start = choose_start(rng, near_goal, paths.critical, goal)
-        nodes = [start]
-        while nodes[-1] != goal:
-            nodes.append(int(step[nodes[-1]]))
+        goal, cost = paths.goals[g], paths.cost[g]
+        nodes = path_nodes(rng, paths, extents, query)
+        start = nodes[0]
         # From the start on: the length to each node, and the edge that each state is on.
         along = cost[start] - cost[nodes]
         wanted = along[-1] * np.arange(1, num_states + 1) / (num_states + 1)
@@ -69,6 +66,18 @@ def make_path_rows(
         length=length.astype(np.float32),
         query=query.astype(np.int32),
     )
+
+
+def path_nodes(
+    rng: np.random.Generator, paths: ShortestPaths, extents: Extents, query: int
+) -> list[int]:
+    """The nodes of a query's shortest path, whose start is drawn."""
+    goal, step = paths.goals[paths.index_of(query)], paths.step[paths.index_of(query)]
+    near_goal = extents.inside(goal, slice(len(paths.critical)))
+    nodes = [choose_start(rng, near_goal, paths.critical, goal)]
+    while nodes[-1] != goal:
+        nodes.append(int(step[nodes[-1]]))
+    return nodes
 
 
 def _states(world: GridWorld, q: np.ndarray, ends: np.ndarray, fraction: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 
 from nrp_jax.homes import houses
 from nrp_jax.learning.difficulty import fair_house
+from nrp_jax.learning.experiences import make_experience_rows
 from nrp_jax.learning.expert import make_rows
 from nrp_jax.learning.paths import make_path_rows
 from nrp_jax.learning.roadmap import build_roadmap
@@ -37,6 +38,7 @@ class DatasetSettings:
     nodes: int = 10_000  # of a home's roadmap
     seed: int = 0
     paths: bool = False  # waypoints are states along whole paths, for a global CVAE
+    experiences: bool = False  # waypoints are the corners of shortened paths, for FIRE
     homes_version: int = houses.VERSION
     rows_version: int = VERSION
 
@@ -70,6 +72,7 @@ def make_shard(settings: DatasetSettings, split: str, index: int, path: Path) ->
     roadmap = build_roadmap(world, robot, jax.random.key(seed), settings.nodes)
     rng = np.random.default_rng(seed)
     make = make_path_rows if settings.paths else make_rows
+    make = make_experience_rows if settings.experiences else make
     rows = make(world, robot, roadmap, rng, settings.queries, settings.waypoints)
     with replacing(path) as file:
         np.savez_compressed(

@@ -14,7 +14,7 @@ import numpy as np
 import optax
 from tqdm import tqdm
 
-from nrp_jax.learning import models
+from nrp_jax.learning import models, similarity
 from nrp_jax.learning.batches import Examples, empty_batch, load_examples, make_batch
 from nrp_jax.learning.checkpoint import Model, build_module, save_model
 from nrp_jax.learning.data import fingerprint, load_dataset
@@ -208,7 +208,9 @@ def add_arguments(subparsers: Any) -> None:
     parser = subparsers.add_parser("train", help="train a sampler, or go on training it")
     parser.set_defaults(run=_run_command)
     parser.add_argument("--task", required=True, choices=models.TASKS, help="whose sampler")
-    parser.add_argument("--model", required=True, choices=models.KINDS, help="which sampler")
+    parser.add_argument(
+        "--model", required=True, choices=(*models.KINDS, models.FIRE), help="which"
+    )
     parser.add_argument(
         "--architecture",
         choices=("light", "published"),
@@ -236,6 +238,9 @@ def add_arguments(subparsers: Any) -> None:
         type=command.whole(1, 100_000),
         help=f"epochs without progress; {TrainConfig.patience}",
     )
+    parser.add_argument(
+        "--pairs", type=command.whole(1, 10_000_000), help="of fire's experiences; 98964"
+    )
     parser.add_argument("--hard", action="store_true", help="labels 0 and 1, none between")
     parser.add_argument(
         "--seed", type=command.seed, default=TrainConfig.seed, help="of weights and batches"
@@ -243,6 +248,8 @@ def add_arguments(subparsers: Any) -> None:
 
 
 def _run_command(arguments: argparse.Namespace) -> int:
+    if arguments.model == models.FIRE:
+        return similarity.run_command(arguments)
     task, kind, published = arguments.task, arguments.model, arguments.architecture == "published"
     make = ModelConfig.published if published else ModelConfig.default
     config = make(task, kind, "map" if arguments.whole_map else "window")

@@ -6,28 +6,33 @@ import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax.config import EDGE_STEPS, PlannerConfig
-from nrp_jax.learning.models import GLOBAL_CVAE
+from nrp_jax.learning.models import FIRE, GLOBAL_CVAE
 from nrp_jax.planners.cvae import CVAERRT, CVAEInformedRRTStar
 from nrp_jax.planners.nrp import NeuralRRT
 from nrp_jax.planners.nrp_connect import NRPConnect, packaged_sampler
 from nrp_jax.planners.nrp_star import NeuralRRTStar
-from nrp_jax.samplers import check_fits, load_sampler
+from nrp_jax.retrieval import UNIFORM_SHARE
+from nrp_jax.samplers import check_fits, load_sampler, packaged_file
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.planners import RRT, BITStar, InformedRRTStar, RRTConnect, RRTStar
 from vrrt_jax.core.types import ExpansionPolicy
 
 CONNECT = ("nrp-connect", "nrp-star-connect")
+DECOMPOSED = "decomposed"
 # Those of the last two rows go on to improve their paths until the budget ends.
 PLANNERS = (
-    *("rrt", "rrt-is", "rrt-connect", "cvae-rrt", "nrp-d", "nrp-g", "nrp-connect"),
+    *("rrt", "rrt-is", "rrt-connect", "cvae-rrt", "fire", "nrp-d", "nrp-g", "nrp-connect"),
     *("rrt-star", "irrt-star", "bit-star", "cvae-irrt-star"),
-    *("nrp-star-d", "nrp-star-g", "nrp-star-connect"),
+    *("nrp-star-d", "nrp-star-g", "nrp-star-connect", "fire-star", DECOMPOSED),
 )
+FETCH_ONLY = ("fire", "fire-star", DECOMPOSED)  # the paper has them for the Fetch alone
 # Of the samplers that planners need.
 KINDS = {
     "cvae-rrt": GLOBAL_CVAE,
     "cvae-irrt-star": GLOBAL_CVAE,
+    "fire": FIRE,
+    "fire-star": FIRE,
     "nrp-d": "discriminator",
     "nrp-g": "cvae",
     "nrp-star-d": "discriminator",
@@ -44,12 +49,34 @@ REWIRING = {
 }
 
 
+def planners_of(task: str) -> tuple[str, ...]:
+    """The names of all planners that a robot has."""
+    return tuple(name for name in PLANNERS if task == "fetch" or name not in FETCH_ONLY)
+
+
+def check_names(task: str, text: str | None) -> tuple[str, ...]:
+    """The planners in a text such as "rrt,bit-star", each once.
+
+    If there is none, all of a robot's that need no weights, or whose weights are packaged.
+
+    Raises:
+        ValueError: the robot has no such planner.
+    """
+    known = planners_of(task)
+    ready = [n for n in known if n not in KINDS or packaged_file(task, KINDS[n]).is_file()]
+    names = tuple(dict.fromkeys(text.split(","))) if text else tuple(ready)
+    if unknown := [name for name in names if name not in known]:
+        raise ValueError(f"unknown planner '{unknown[0]}'; have: {', '.join(known)}")
+    return names
+
+
 def policy_of(
     planner: str | ExpansionPolicy,
     robot: MobileRobot,
     world: GridWorld,
     sampler: Any,
     config: PlannerConfig,
+    ends: tuple[Any, Any],
 ) -> ExpansionPolicy:
     """The policy of a planner by name, or the object itself.
 
@@ -59,12 +86,16 @@ def policy_of(
         world: the robot in a home.
         sampler: of the planners that have one; the packaged one if None.
         config: settings.
+        ends: start and goal (D,) in the world, for samplers that retrieve.
 
     Raises:
-        ValueError: the sampler does not fit.
+        ValueError: the sampler does not fit, or the planner is for another robot.
     """
     if not isinstance(planner, str):
         return planner
+    if planner not in planners_of(robot.name):
+        names = ", ".join(planners_of(robot.name))
+        raise ValueError(f"planner '{planner}' is for the fetch; '{robot.name}' has: {names}")
     if planner == "rrt-connect":
         return RRTConnect(lanes=max(config.lanes, 2))
     bias = jnp.float32(config.goal_bias)
@@ -73,7 +104,7 @@ def policy_of(
         return RRT(goal_bias=bias, intermediate=planner == "rrt-is", **shape)
     if planner == "bit-star":
         return BITStar(lanes=config.lanes, edge_steps=EDGE_STEPS)
-    if planner in ("rrt-star", "irrt-star"):
+    if planner in ("rrt-star", "irrt-star", DECOMPOSED):
         make = RRTStar if planner == "rrt-star" else InformedRRTStar
         return make(goal_bias=bias, **shape, **REWIRING)
     # The others have learned samplers.
@@ -83,10 +114,14 @@ def policy_of(
             packaged_sampler(robot.name) if packaged else load_sampler(robot.name, KINDS[planner])
         )
     check_fits(sampler, robot, world, KINDS[planner])
-    if KINDS[planner] == GLOBAL_CVAE:
-        share = jnp.float32(config.uniform_share)
-        drawn = {"goal_bias": bias, "sampler": sampler, "uniform_share": share, **shape}
-        if planner == "cvae-rrt":
+    if KINDS[planner] in (GLOBAL_CVAE, FIRE):
+        share = config.uniform_share
+        if KINDS[planner] == FIRE:
+            share = UNIFORM_SHARE
+            sampler = sampler.retrieve(world, *ends)
+        drawn = {"goal_bias": bias, "sampler": sampler, **shape}
+        drawn["uniform_share"] = jnp.float32(share)
+        if planner in ("cvae-rrt", "fire"):
             return CVAERRT(**drawn)
         return CVAEInformedRRTStar(**drawn, **REWIRING)
     if planner in CONNECT:

@@ -67,6 +67,14 @@ def make_near_cells(grid: Grid, radius: float) -> NearCells:
     )
 
 
+def occupied_cells(near: NearCells) -> np.ndarray:
+    """Which cells (X, Y, Z) of the map are solid."""
+    # Of the near cells the middle one is the cell itself.
+    own = ((2 * near.reach + 1) ** (2 if near.is_planar else 3)) // 2
+    word, bit = divmod(own, _WORD)
+    return ((np.asarray(near.bits[..., word]) >> np.uint32(bit)) & 1).astype(bool)
+
+
 def touches(near: NearCells, points: jax.Array, radius: jax.Array) -> jax.Array:
     """Whether spheres touch a solid cell, (n,) bool; beside the map all is solid.
 

@@ -8,6 +8,7 @@ from nrp_jax.homes.grid import Grid
 from nrp_jax.scene.car_world import CarWorld
 from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.grid_world import GridWorld
+from nrp_jax.scene.near_cells import occupied_cells
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import batch_is_free, corner_of, from_corner
 from vrrt_jax.core.check_protocols import overrides_is_free
@@ -124,15 +125,13 @@ def touching(robot: MobileRobot, world: GridWorld, q: np.ndarray) -> str:
     """
     near, corner = world.near[0], corner_of(world)
     cell = float(near.cell)
-    # The cells around the base: the middle one of the near cells is the cell itself.
-    own = ((2 * near.reach + 1) ** (2 if near.is_planar else 3)) // 2
-    word, bit = divmod(own, 32)
+    # The cells around the base.
     base = np.floor((q[:2] - corner) / cell).astype(int)
     first = np.maximum(base - round(_AROUND / cell), 0)
     last = base + round(_AROUND / cell) + 1
-    bits = np.asarray(near.bits[first[0] : last[0], first[1] : last[1], :, word])
+    solid = occupied_cells(near)[first[0] : last[0], first[1] : last[1]]
     origin = (*(corner + first * cell), float(near.bottom))
-    scene = ExactScene(robot, Grid(occupied=(bits >> bit) & 1, resolution=cell, origin=origin))
+    scene = ExactScene(robot, Grid(occupied=solid, resolution=cell, origin=origin))
     return scene.nearest_contact(q)
 
 

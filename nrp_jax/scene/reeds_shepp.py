@@ -67,12 +67,12 @@ def extent(curve: Curve, radius: jax.Array | float) -> jax.Array:
 
     On a tight arc a short drive is a large turn, and the turn sweeps the outstretched arm around.
     """
-    pieces = _extents(curve, radius)
+    pieces = piece_extents(curve, radius)
     return sum(pieces[1:], pieces[0])
 
 
-def _extents(curve: Curve, radius: jax.Array | float) -> list[jax.Array]:
-    """The extents of the pieces, 5 of (...)."""
+def piece_extents(curve: Curve, radius: jax.Array | float) -> list[jax.Array]:
+    """The extents of the pieces, 5 of (...); see :func:`extent`."""
     tight = jnp.maximum(radius, 1.0)
     return [
         jnp.abs(drive) * jnp.where(turn == 0, radius, tight)
@@ -84,7 +84,7 @@ def truncate(curve: Curve, fraction: jax.Array, radius: jax.Array | float) -> Cu
     """The first fraction (...) of curves, measured by their :func:`extent`."""
     # Piece by piece: drive it as far as what is left of the extent allows.
     left, drives = fraction * extent(curve, radius), []
-    for drive, size in zip(curve.drive, _extents(curve, radius), strict=True):
+    for drive, size in zip(curve.drive, piece_extents(curve, radius), strict=True):
         drives.append(drive * jnp.clip(left / jnp.maximum(size, 1e-12), 0.0, 1.0))
         left = left - size
     turns = tuple(jnp.broadcast_to(turn, left.shape) for turn in curve.turn)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import nrp_jax
-from nrp_jax.planners.by_name import PLANNERS
+from nrp_jax.planners.by_name import planners_of
 from nrp_jax.scene.exact import ExactScene, verify
 
 KEY = jax.random.key(0)
@@ -26,7 +26,7 @@ def floor():
 
 
 @pytest.mark.light_compilation
-@pytest.mark.parametrize("method", PLANNERS)
+@pytest.mark.parametrize("method", planners_of("snake"))
 def test_a_plan_that_starts_at_its_goal_searches_for_nothing(snake, floor, method):
     for turns in (0.0, 2 * np.pi):
         start = np.array(SNAKE)

@@ -53,6 +53,7 @@ def postprocess(
     *,
     key: jax.Array,
     rounds: int = 150,
+    shorten: Callable[..., np.ndarray] = shortcut,
 ) -> Postprocessed:
     """Shorten a path and verify it; if the short path is refused, the raw one may still be right.
 
@@ -64,12 +65,13 @@ def postprocess(
         check: the exact check of a path (P, D).
         key: random key.
         rounds: of shortcutting.
+        shorten: what shortens the path, as :func:`vrrt_jax.core.shortcut.shortcut` does.
     """
     raw_path = without_repeats(world, raw_path)
     begun_s = time.perf_counter()
-    shortcut(world, raw_path, key=key, rounds=0)  # compiles, if anything has to
+    shorten(world, raw_path, key=key, rounds=0)  # compiles, if anything has to
     compiled_s = time.perf_counter()
-    short_path = without_repeats(world, shortcut(world, raw_path, key=key, rounds=rounds))
+    short_path = without_repeats(world, shorten(world, raw_path, key=key, rounds=rounds))
     shortened_s = time.perf_counter()
     verdicts = [check(short_path)]
     if _is_refused(verdicts[0]) and not np.array_equal(short_path, raw_path):

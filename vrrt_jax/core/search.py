@@ -71,6 +71,7 @@ class SearchResult:
     search_s: float
     lanes: int = 32  # expansions an iteration
     stopped_each: tuple[StopReason, ...] = ()  # of the problems of a batch
+    advice: str = ""  # what failed and what to try next, where ``stopped`` does not tell
 
 
 def make_termination(
