@@ -175,7 +175,7 @@ def plan(
 def _searched(
     planner: str | ExpansionPolicy,
     robot: MobileRobot,
-    world: GridWorld,
+    world: Any,
     goal: Any,
     policy: Any,
     tree: Any,

@@ -30,9 +30,8 @@ from vrrt_jax.visual.polish import compile_polishing
 from vrrt_jax.visual.problem import VisualProblem
 
 ATTEMPT_KEY = 0x7FFFFFFF  # folded into the key of a later attempt; iterations count from 0
-MORE_EACH = 2  # attempts that do more than the one before
+MORE_EACH = 2  # attempts that do more than the one before; as many confirm what is in doubt
 ROOT_SAMPLES, ROOT_BATCHES = 4096, 8  # random configurations, of which some are roots
-RETRYABLE = (Status.NO_MATCH, Status.NO_PATH, Status.NOT_VERIFIED)  # worth another attempt
 
 
 def plan_by_loss(
@@ -55,7 +54,10 @@ def plan_by_loss(
         for again in range(1, config.budget.attempts):
             rest = time_left(config, result.timing["search_s"])
             # A match in strange colors is believed, if two more attempts find no better one.
-            goes_on = result.status in RETRYABLE or (again <= 2 and _has_strange_colors(result))
+            # Where a match has no path, two more are asked too.
+            few_more = result.status in (Status.NO_PATH, Status.NOT_VERIFIED)
+            few_more |= _has_strange_colors(result)
+            goes_on = result.status is Status.NO_MATCH or (few_more and again <= MORE_EACH)
             if not goes_on or rest.budget.time_limit_s == 0:
                 break
             key = jax.random.fold_in(key, ATTEMPT_KEY - again)

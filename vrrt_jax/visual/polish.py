@@ -43,6 +43,7 @@ SETTLE_STEPS = 8  # at most, on the large images
 PROMISING = 6.0  # times the least cost; ends that cost more, and do not match, are left
 TWINNED = 2  # best ends whose kinematic twins are looked at
 TURNS = 12  # in which the last joint goes all the way round
+TURNED = 3  # times as many ends of these turns as are kept
 SECOND_SPREAD = 0.5  # how far samples spread in the second round, in units of the others
 LEAST_COVERED = 0.01  # share of a close-up; a hand that is hidden tells nothing
 
@@ -92,10 +93,11 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
     config, coarse, fine = polishing.config, polishing.coarse, polishing.fine
     ends = _search_around(world, polishing, q, np.random.default_rng(seed))
 
-    # The fine image, from every minimum over a whole turn of the last joint.
-    q = _promising(ends, coarse).q
-    turned = _turns_of_last_hinge(world, fine, q, config.kept)
-    ends = _distinct_ends(world, _settled(world, fine, turned), config.kept)
+    # From every minimum over a whole turn of the last joint, to the fine image.
+    turned = _turns_of_last_hinge(world, coarse, ends.q, TURNED * config.kept)
+    ends = _distinct_ends(world, _settled(world, coarse, turned), config.kept)
+    ends = _settled(world, fine, _promising(ends, coarse).q)
+    ends = _distinct_ends(world, ends, config.kept)
     others = nearer_turns(world, twins(world, ends.q[:TWINNED]), np.asarray(fine.prior.q))
     if len(others):
         found = _settled(world, fine, others)
@@ -131,7 +133,7 @@ def compile_polishing(world: World, polishing: Polishing) -> None:
     soft, coarse, fine = polishing.soft, polishing.coarse, polishing.fine
     q = np.asarray(fine.prior.q)[None]
     derivatives(world, soft, q)
-    for goal in (soft, fine):
+    for goal in (soft, coarse, fine):
         evaluate_each(world, goal, q)
     for goal in (coarse, fine):
         settle_each(world, [goal], q, 0)
