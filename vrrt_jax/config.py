@@ -54,7 +54,7 @@ class ExpandConfig:
 class PolishConfig:
     """Least squares after the search, which tells apart what the small images cannot."""
 
-    hypotheses: int = setting(4, 0, 1024)  # distinct best nodes that are polished; 0 = none
+    hypotheses: int = setting(4, 0, 1024)  # best nodes polished; 0 = none (re-compiles)
     samples: int = setting(256, 1, 65536)  # around them in each round, and as many drawn anew
     lanes: int = setting(32, 1, 1024)  # best samples, which descend
     kept: int = setting(8, 1, 1024)  # distinct ends that go on

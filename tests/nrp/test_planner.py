@@ -315,7 +315,7 @@ def test_bench_counts_verified_plans(snake, home, scene, tmp_path, monkeypatch, 
     assert main([*command, "--methods", "rrt-connect", "--max-expansions", "10"]) == 0
     assert json.loads(out.read_text())["methods"]["rrt-connect"]["success"] == 0.0
     assert main([*command, "--methods", "prm"]) == 2
-    assert "unknown method 'prm'; have: rrt, rrt-is" in capsys.readouterr().err
+    assert "unknown planner 'prm'; have: rrt, rrt-is" in capsys.readouterr().err
 
 
 def test_an_optimal_planner_and_a_goal_of_ones_own(snake, home, scene):

@@ -125,7 +125,7 @@ def test_a_pose_that_is_refused_moves_and_is_told(home):
     poses = {name: np.array(q) for name, q in POSES.items()}
     poses["wall"] = np.array([2.34, 1.0, -1.2, *POSES["left"][3:]])  # the base, by 1 cm
     poses["outside"] = np.array([9.0, 1.0, *POSES["left"][2:]])
-    found = curve_homes._with_poses(robot, "home", grid, poses, 50)
+    found = curve_homes._with_poses(robot, "home", grid, poses, 50, legs=False)
     assert [*found.notes["poses_moved"]] == ["wall"]
     assert "touches the map" in found.notes["poses_moved"]["wall"]["refused"]
     moved = np.array(found.notes["poses_moved"]["wall"]["instead"])
