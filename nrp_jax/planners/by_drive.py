@@ -13,12 +13,11 @@ from nrp_jax.planners.nrp_connect import NRPConnect, search_connect
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners.rrt_connect import ConnectNode
-from vrrt_jax.core.search import SearchResult, StopReason, Termination, search
+from vrrt_jax.core.search import COST, SearchResult, StopReason, Termination, search
 from vrrt_jax.core.shortcut import path_length, without_repeats
 from vrrt_jax.core.tree import joined
 from vrrt_jax.core.types import Tree
 
-COST = 4  # column of a history: length of the best path
 SUMS = [0, 1, 3, 5]  # columns that never fall: iterations, seconds, nodes, checks
 MOST = 16  # iterations from an end to the drive
 RANKS = (0, 3, 15, 63)  # of the postures that are tried one after the other

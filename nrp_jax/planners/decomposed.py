@@ -20,7 +20,7 @@ from nrp_jax.scene.world import batch_is_free
 from vrrt_jax.core.edges import Space
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners.informed_rrt_star import InformedRRTStar
-from vrrt_jax.core.search import SearchResult, StopReason, Termination, no_search, search
+from vrrt_jax.core.search import COST, SearchResult, StopReason, Termination, no_search, search
 from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import Tree
 
@@ -28,7 +28,6 @@ from vrrt_jax.core.types import Tree
 REST = np.array([0.02, 1.1708, 1.4708, -0.4, 1.6708, 0.0, 1.5708, 0.0], np.float32)
 BASE = 3  # joints of the base
 TURN_S = 0.25  # the searches of the two arm legs take turns of so many seconds
-COST = 4  # column of a history
 ARM_LEGS = ("to its rest pose at the start", "from its rest pose to the goal")
 ELSEWHERE = "take a planner of the whole body, such as nrp-star-connect"
 

@@ -13,11 +13,9 @@ from nrp_jax.planners.drive import Folded
 from nrp_jax.planners.nrp_connect import NRPConnect
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.goal import ConfigurationGoal
-from vrrt_jax.core.search import SearchResult, StopReason, Termination
+from vrrt_jax.core.search import COST, SearchResult, StopReason, Termination
 from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import Tree
-
-COST = 4  # column of a history: length of the best path
 
 
 def search_with_restarts(

@@ -22,6 +22,7 @@ from vrrt_jax.core.types import ExpansionPolicy, Tree, pytree
 
 MAX_CAPACITY = 1 << 20  # nodes that a tree may grow to
 CHUNK = 8  # iterations between two checks of the clock
+COST = 4  # column of a history: length of the best path
 
 
 class StopReason(enum.IntEnum):
