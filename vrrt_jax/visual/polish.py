@@ -24,9 +24,10 @@ from vrrt_jax.scene.world import World
 from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.images import cut_goal
 from vrrt_jax.splat.types import Camera, SplatModel
-from vrrt_jax.visual.distinct import distinct
+from vrrt_jax.visual.distinct import MIN_SEPARATION, distances_to, distinct
 from vrrt_jax.visual.goal import CloseUp
 from vrrt_jax.visual.least_squares import (
+    PAYS,
     Ends,
     Objective,
     Parabola,
@@ -35,13 +36,20 @@ from vrrt_jax.visual.least_squares import (
     evaluate_each,
     settle_each,
 )
-from vrrt_jax.visual.polish_samples import last_hinge, nearer_turns, redraw_outer, sample_around
+from vrrt_jax.visual.polish_samples import (
+    half_turned,
+    last_hinge,
+    nearer_turns,
+    redraw_outer,
+    sample_around,
+)
 from vrrt_jax.visual.twins import twins
 
 LEAST_TOLD = 1e-3  # of a threshold per rad^2; joints that raise the loss by less are not told
 SETTLE_STEPS = 8  # at most, on the large images
 PROMISING = 6.0  # times the least cost; ends that cost more, and do not match, are left
-TWINNED = 2  # best ends whose kinematic twins are looked at
+RIVALS = 2.0  # times the least cost; ends that cost more on the fine image are left
+TWINNED = 2  # best ends whose kinematic twins, and half turns of the hand, are looked at
 TURNS = 12  # in which the last joint goes all the way round
 TURNED = 3  # times as many ends of these turns as are kept
 SECOND_SPREAD = 0.5  # how far samples spread in the second round, in units of the others
@@ -100,29 +108,23 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
     ends = _distinct_ends(world, ends, config.kept)
     others = nearer_turns(world, twins(world, ends.q[:TWINNED]), np.asarray(fine.prior.q))
     if len(others):
-        found = _settled(world, fine, others)
-        both = Ends(*(np.concatenate(columns) for columns in zip(ends, found, strict=True)))
-        ends = _distinct_ends(world, both, config.kept)
+        ends = _distinct_ends(world, _joined(ends, _settled(world, fine, others)), config.kept)
 
-    # Once more, where derivatives are those of the minimum.
-    ends = _settled(world, fine, _promising(ends, fine).q)
-    ends = _distinct_ends(world, ends, config.kept)
-
-    # The close-up of the hand, together with the fine image.
-    if polishing.close_up is not None:
-        ends = _distinct_ends(
-            world, _settled_close_up(world, polishing, polishing.close_up, ends), config.kept
-        )
-    colored = evaluate_each(world, fine, ends.q)[0]
+    # Once more the best, where derivatives are those of the minimum.
+    ends = ends.take(ends.cost <= RIVALS * ends.cost[0])
+    if polishing.close_up is None:
+        ends = _distinct_ends(world, _settled(world, fine, ends.q), config.kept)
+    else:
+        ends = _settled_with_hand(world, polishing, polishing.close_up, ends)
     judge = getattr(fine.goal, "judge", None)
-    loss = colored
+    loss = ends.loss
     if judge is not None:
         loss = evaluate_each(world, dataclasses.replace(fine, goal=judge), ends.q)[0]
     informed = ends.matrix - np.asarray(fine.prior.matrix)
     return Polished(
         q=ends.q,
         loss=loss,
-        colored_loss=colored,
+        colored_loss=ends.loss,
         cost=np.where(ends.free, ends.cost, np.inf),
         uncertainty=joint_uncertainty(informed, polishing.threshold),
     )
@@ -149,7 +151,7 @@ def _search_around(
     config, soft, coarse = polishing.config, polishing.soft, polishing.coarse
     for k in range(config.rounds):
         spread = config.spread * (SECOND_SPREAD if k == 1 else 1.0)
-        around = sample_around(q, last_hinge(world), config.samples, spread, rng)
+        around = sample_around(world, q, config.samples, spread, rng)
         samples = np.concatenate([around, redraw_outer(world, q, config.samples, rng)])
         samples = nearer_turns(world, samples, np.asarray(soft.prior.q))
         cost = evaluate_each(world, soft, samples)[1]
@@ -213,19 +215,50 @@ def _turns_of_last_hinge(world: World, objective: Objective, q: np.ndarray, num:
     return around[order[: min(num, np.sum(is_minimum))]]
 
 
-def _settled_close_up(world: World, polishing: Polishing, close_up: CloseUp, ends: Ends) -> Ends:
-    """Settle on the fine image and a close-up of the first end's hand together, twice.
+def _joined(ends: Ends, others: Ends) -> Ends:
+    return Ends(*(np.concatenate(columns) for columns in zip(ends, others, strict=True)))
 
-    The cost is the sum of both; the fine image's is taken for the parabola that it is around ends.
+
+def _settled_with_hand(world: World, polishing: Polishing, close_up: CloseUp, ends: Ends) -> Ends:
+    """Settle on the fine image and a close-up of the hand; also after half a turn of the hand."""
+    fine, num = polishing.fine, polishing.config.kept
+    goal, threshold = _hand_goal(world, fine, close_up, ends.q[0])
+    weight = polishing.threshold / threshold
+    ends = _distinct_ends(world, _settled_together(world, fine, goal, weight, ends), num)
+    turned = nearer_turns(world, half_turned(world, ends.q[:TWINNED]), np.asarray(fine.prior.q))
+    turned = turned[[np.min(distances_to(world, ends.q, q)) > MIN_SEPARATION for q in turned]]
+    if not len(turned):
+        return ends
+    turned = _settled_together(world, fine, goal, weight, derivatives(world, fine, turned))
+    return _distinct_ends(world, _joined(ends, turned), num)
+
+
+def _settled_together(
+    world: World, fine: Objective, goal: Objective, weight: float, ends: Ends
+) -> Ends:
+    """Settle on the fine image and another one, which has a weight, together.
+
+    The cost is the sum of both. In each pass the fine image's is taken for the parabola that it is
+    around the ends of the one before; a hand slides farther than that holds. Ends go on while that
+    pays, and while they cost little more than the best.
     """
-    goal, threshold = _hand_goal(world, polishing.fine, close_up, ends.q[0])
-    goal = dataclasses.replace(goal, weight=jnp.float32(polishing.threshold / threshold))
-    around = [
-        dataclasses.replace(goal, prior=Parabola(q=q, cost=cost, slope=slope, matrix=matrix))
-        for q, _, cost, slope, matrix, _ in zip(*ends, strict=True)
-    ]
-    settled = settle_each(world, around, ends.q, SETTLE_STEPS)
-    return settle_each(world, around, settled.q, SETTLE_STEPS)
+    goal = dataclasses.replace(goal, weight=jnp.float32(weight))
+    rows, done = np.arange(len(ends.q)), ends._replace(cost=np.full(len(ends.q), np.inf))
+    while len(rows):
+        around = [
+            dataclasses.replace(goal, prior=Parabola(q=q, cost=cost, slope=slope, matrix=matrix))
+            for q, _, cost, slope, matrix, _ in zip(*ends, strict=True)
+        ]
+        close = settle_each(world, around, ends.q, SETTLE_STEPS)
+        ends = derivatives(world, fine, close.q)
+        both = ends._replace(cost=ends.cost + weight * close.loss, matrix=close.matrix)
+        pays = both.cost < (1 - PAYS) * done.cost[rows]
+        pays &= both.cost < RIVALS * np.min(both.cost)
+        better = both.cost < done.cost[rows]
+        for column, new in zip(done, both, strict=True):
+            column[rows[better]] = new[better]
+        rows, ends = rows[pays], ends.take(pays)
+    return done
 
 
 def _hand_goal(

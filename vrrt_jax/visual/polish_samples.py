@@ -24,18 +24,22 @@ def nearer_turns(world: World, q: np.ndarray, q_start: np.ndarray) -> np.ndarray
     return np.where(inside & world.chain.is_hinge, turned, q)
 
 
+def half_turned(world: World, q: np.ndarray) -> np.ndarray:
+    """Configurations (n, D) after half a turn of the hand, where many grippers look the same."""
+    hinge, turned = last_hinge(world), q.copy()
+    turned[:, hinge] += np.where(q[:, hinge] > 0, -np.pi, np.pi)
+    return turned
+
+
 def sample_around(
-    q: np.ndarray, hinge: int, num: int, spread: float, rng: np.random.Generator
+    world: World, q: np.ndarray, num: int, spread: float, rng: np.random.Generator
 ) -> np.ndarray:
     """Samples (num, D) around configurations (H, D), which are the first of them."""
-    # Grippers look alike after half a turn of the last joint.
-    turned = q.copy()
-    turned[:, hinge] += np.where(q[:, hinge] > 0, -np.pi, np.pi)
     # Each sample moves a random share of its joints.
     shape = (-(-num // len(q)), *q.shape)
     moved = rng.uniform(size=shape) < rng.uniform(FEWEST_MOVED, 1.0, (*shape[:2], 1))
     around = q + spread * moved * rng.normal(size=shape)
-    return np.concatenate([q, turned, around.reshape(-1, q.shape[1])])[:num]
+    return np.concatenate([q, half_turned(world, q), around.reshape(-1, q.shape[1])])[:num]
 
 
 def redraw_outer(world: World, q: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:
