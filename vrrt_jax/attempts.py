@@ -30,7 +30,8 @@ from vrrt_jax.visual.polish import compile_polishing
 from vrrt_jax.visual.problem import VisualProblem
 
 ATTEMPT_KEY = 0x7FFFFFFF  # folded into the key of a later attempt; iterations count from 0
-MORE_EACH = 2  # attempts that do more than the one before; as many confirm what is in doubt
+MORE_EACH = 2  # attempts that do more than the one before
+CONFIRMING = 2  # more attempts where a match is in doubt, or has no path
 ROOT_SAMPLES, ROOT_BATCHES = 4096, 8  # random configurations, of which some are roots
 
 
@@ -53,11 +54,10 @@ def plan_by_loss(
         result = attempt(robot, world, problem, policy, roots, key, config, on_progress)
         for again in range(1, config.budget.attempts):
             rest = time_left(config, result.timing["search_s"])
-            # A match in strange colors is believed, if two more attempts find no better one.
-            # Where a match has no path, two more are asked too.
+            # A match in strange colors is believed if a few more attempts find no better one.
             few_more = result.status in (Status.NO_PATH, Status.NOT_VERIFIED)
             few_more |= _has_strange_colors(result)
-            goes_on = result.status is Status.NO_MATCH or (few_more and again <= MORE_EACH)
+            goes_on = result.status is Status.NO_MATCH or (few_more and again <= CONFIRMING)
             if not goes_on or rest.budget.time_limit_s == 0:
                 break
             key = jax.random.fold_in(key, ATTEMPT_KEY - again)

@@ -73,8 +73,8 @@ class MatchConfig:
     """When an image counts as matched, and which of several matches is taken."""
 
     scale: float = setting(1.0, 1e-9)  # the threshold, in units of the self-model's calibrated one
-    # Matches whose cost is within this factor of the best one's look the same: the nearest to the
-    # start is taken, and the others are named.
+    # Matches whose cost is within this factor of the best one's look the same: one is taken, by its
+    # cost and its distance from the start, and the others are named.
     ambiguity: float = setting(1.1, 1.0)
 
 

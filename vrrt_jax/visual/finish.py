@@ -29,6 +29,10 @@ MAX_GOALS = 3  # matched configurations that are tried before there is no path
 MAX_REPLANS = 3  # paths that the exact check may refuse before it has the last word
 MARGIN_STEP = 0.01  # [m] by which each of them keeps farther away than the one before
 UNTOLD = 0.3  # [rad] or [m] joints that may be off by more are named
+# A near match is likelier: goals are taken to be as dense as distance ** -joints, which favors no
+# scale. A factor of e in density is worth as much as this share of a threshold in cost.
+NEARNESS = 0.03
+NEAR = 0.1  # [rad] all that are nearer are as likely
 SAME_LOSS = 1.05  # losses within this factor are the same match
 
 
@@ -203,12 +207,13 @@ def _polished_ends(
     config: PlannerConfig,
 ) -> Ends:
     """Polished configurations in the order in which they are tried."""
-    # A match goes before all others; of those that look the same, the nearest to the start.
+    # A match goes before all others; those that look the same are weighed by their distances.
     fits = polished.loss <= threshold
     least = np.min(polished.cost, where=fits, initial=np.inf)
     alike = fits & (polished.cost <= config.match.ambiguity * least)
-    far = distances_to(world, polished.q, q_start)
-    order = np.lexsort([np.where(alike, far, polished.cost), ~alike, ~fits])
+    far = np.maximum(distances_to(world, polished.q, q_start), NEAR)
+    weighed = polished.cost + NEARNESS * threshold * len(q_start) * np.log(far)
+    order = np.lexsort([np.where(alike, weighed, polished.cost), ~alike, ~fits])
     rivals = [int(k) for k in order if np.isfinite(polished.cost[k])]
     matched = [k for k in rivals if polished.loss[k] <= threshold]
     return Ends(

@@ -111,6 +111,20 @@ def test_a_match_without_a_way_is_told(slider, monkeypatch):
     assert result.advice == "all that was found is in collision: move the obstacles"
 
 
+def test_of_matches_that_look_the_same_cost_and_distance_decide(slider):
+    world = vrrt_jax.build_world(slider, [], engine="closed_form")
+    near, far = q = np.array([[0.3], [0.6]], np.float32)
+
+    def taken(costs):
+        polished = dataclasses.replace(reached(q, np.full(2, 0.5), 0.1), cost=np.array(costs))
+        ends = finish._polished_ends(world, polished, 1.0, np.zeros(1, np.float32), PlannerConfig())
+        assert sorted(ends.rivals) == [0, 1]
+        return ends.q[ends.order[0]]
+
+    assert taken([1.0, 1.0]) == near and taken([1.01, 1.0]) == near
+    assert taken([1.05, 1.0]) == far  # the image tells them apart
+
+
 @pytest.mark.parametrize("time_limit_s", [np.inf, 0.0])
 def test_a_match_is_missed_before_a_way(slider, monkeypatch, time_limit_s):
     """Also where the time ran out on the way to what matches nothing."""
