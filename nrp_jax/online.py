@@ -1,18 +1,19 @@
 """Training of NEXT: on an expert's paths first, then on those that its own planner finds.
 
-After Chen et al. (ICLR 2020): the planner solves problems in the training homes, exploring ever less,
-and every so many new states the network is trained again. Letters: ``K`` states of a path, ``D``
-joints.
+After Chen et al. (ICLR 2020): the planner solves problems in the training homes, exploring ever
+less, and every so many new states the network is trained again. Letters: ``K`` states of a path,
+``D`` joints.
 """
 
 import argparse
 import dataclasses
+import itertools
 import sys
 import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,20 +21,17 @@ import numpy as np
 import optax
 from tqdm import tqdm
 
-from nrp_jax.config import PlannerConfig
 from nrp_jax.learning.checkpoint import Model, build_module, save_model
 from nrp_jax.learning.data import Dataset, fingerprint, load_dataset
-from nrp_jax.learning.difficulty import long_queries
 from nrp_jax.learning.models import NEXT, ModelConfig
 from nrp_jax.learning.next_rows import (
     PathExamples,
-    even_states,
     next_loss,
     path_batch,
     path_examples,
     with_paths,
 )
-from nrp_jax.learning.recipe import TrainConfig
+from nrp_jax.learning.recipe import OnlineConfig, TrainConfig
 from nrp_jax.learning.train import split_by_home
 from nrp_jax.learning.training_io import (
     CheckpointStore,
@@ -43,48 +41,11 @@ from nrp_jax.learning.training_io import (
     plot_curves,
     write_log,
 )
-from nrp_jax.planners.by_name import policy_of
-from nrp_jax.samplers import make_sampler
+from nrp_jax.online_problems import FoundPaths, Problems
 from nrp_jax.scene.robots import MobileRobot, load_robot
-from nrp_jax.scene.world import build_world
 from vrrt_jax.core import command
-from vrrt_jax.core.files import replacing
-from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.precision import single_precision
-from vrrt_jax.core.search import COST, make_termination, search
-from vrrt_jax.core.settings import check_settings, setting
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class OnlineConfig:
-    """How NEXT is trained; the defaults are those that the NRP paper's authors published."""
-
-    epochs: int = setting(50, 1, 100_000)  # on the expert's paths
-    batch: int = setting(256, 1, 65_536)  # states a step
-    learning_rate: float = setting(1e-3, 1e-8, 1.0)
-    weight_decay: float = setting(5e-5, 0.0, 1.0)  # in the gradient
-    value_weight: float = setting(0.1, 0.0, 1e3)  # of the values' squared error in the loss
-    augment: bool = False  # turn and mirror each path at random
-    problems: int = setting(9000, 0, 1_000_000)  # that its planner tries in the training homes
-    expansions: int = setting(500, 1, 1_000_000)  # of a problem
-    states: int = setting(2000, 1, 1_000_000)  # new ones after which it is trained again
-    round_epochs: int = setting(10, 1, 100_000)  # of each such training, on all paths so far
-    explored: float = setting(1.0, 0.0, 1.0)  # share of RRT*'s expansions in the first problems
-    least_explored: float = setting(0.1, 0.0, 1.0)  # and in the last ones, by tenths
-    lanes: int = setting(32, 1, 4096)  # expansions at a time
-    validation: float = 0.15  # share of the homes that is held out
-    minutes: float = setting(1e6, 0.0, endless=True)  # no epoch begins after so many
-    seed: int = setting(0, 0, 2**31)
-
-    @classmethod
-    def light(cls) -> Self:
-        """For two cores: a tenth of the problems, fewer epochs, shorter rounds, and symmetries."""
-        return cls(epochs=8, problems=900, states=1000, round_epochs=1, augment=True, minutes=60.0)
-
-    def explored_in(self, problem: int) -> float:
-        """The share of RRT*'s expansions in a problem."""
-        tenths = int(10 * (self.explored - self.least_explored) * problem / max(self.problems, 1))
-        return max(self.explored - tenths / 10, self.least_explored)
+from vrrt_jax.core.settings import check_settings
 
 
 @single_precision
@@ -100,7 +61,7 @@ def train_online(
 ) -> Model:
     """Train NEXT.
 
-    An interrupted training goes on from its last checkpoint.
+    An interrupted training goes on from its last epoch.
 
     Args:
         config: the architecture.
@@ -110,100 +71,72 @@ def train_online(
             out), ``log.csv``, ``curves.png``, ``checkpoint/`` and the paths that were found.
         settings: of the training; the published ones if None.
         stamp: names the data; a training goes on only with the same.
-        progress: show progress bars.
+        progress: show a progress bar.
 
     Raises:
         ValueError: ``out`` holds another training, the data set has no paths of this robot, or too
             few homes to hold some out.
         RuntimeError: the validation loss is not finite any more.
     """
+    began = time.perf_counter()
     settings = OnlineConfig() if settings is None else settings
     check_settings(settings)
-    began = time.perf_counter()
-    examples = path_examples(config, robot, dataset, settings.problems)
-    num_expert = len(dataset) // dataset.settings.waypoints
-    home = np.asarray(examples.home)[:num_expert]
-    split = TrainConfig(seed=settings.seed, validation=settings.validation)
-    training, validation = split_by_home(home, split)
+    data = _Data.of(config, robot, dataset, settings)
     recipe = dataclasses.asdict(dataclasses.replace(settings, minutes=0.0))
     parts = {"model": dataclasses.asdict(config), "settings": recipe, "data": stamp}
     out = claim_output_dir(Path(out), parts)
-
-    # The network, the optimizer, and a random or restored state.
-    module = build_module(config, robot.num_joints)
-    optimizer = optax.chain(
-        optax.add_decayed_weights(settings.weight_decay), optax.adam(settings.learning_rate)
-    )
-    first = jax.eval_shape(partial(path_batch, config, robot), examples, jnp.zeros(1, jnp.int32))
-    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), first)
-    key = jax.random.key(settings.seed)
-    variables: Any = jax.jit(module.init)(key, zeros.image, zeros.goal, zeros.q)
-    state = State(variables=variables, optimizer=optimizer.init(variables), step=jnp.int32(0))
+    module, optimizer, state = _network(config, robot, data.examples, settings)
     store = CheckpointStore(out / "checkpoint")
     state, best, history = store.restore(state)
     update, evaluate = _programs(config, robot, module, optimizer, settings)
-    problems = _Problems(robot, dataset, np.unique(home[training]), settings)
+    problems = Problems(robot, dataset, data.training_homes, settings)
     before_s = sum(row["seconds"] for row in history)
 
     def model_of(variables: Any) -> Model:
-        info = {"num_outputs": robot.num_joints, "data": stamp}
+        info: dict[str, Any] = {"num_outputs": robot.num_joints, "data": stamp}
         if history:
             info["best"] = min(history, key=lambda row: row["loss"])
         return Model(config=config, variables=variables, info=info)
 
-    # Epochs on the expert's paths, then rounds of problems with epochs on all paths.
-    size = max(settings.batch // (examples.q.shape[1] - 1), 1)
-    size, num, tried, rounds, solved = min(size, len(training)), num_expert, 0, 0, 0.0
-    bar = tqdm(desc=f"{config.task} {NEXT}", unit="epoch", disable=not progress)
-    epoch = 0
-    while True:
-        wanted = max(0, (epoch - settings.epochs) // settings.round_epochs + 1)
-        late = before_s + time.perf_counter() - began > 60 * settings.minutes
-        is_old = epoch < len(history)
-        if not is_old and (late or (wanted > rounds and tried >= settings.problems)):
-            break
+    # Epochs on the expert's paths, then rounds of problems, each with epochs on all paths.
+    bar = tqdm(
+        desc=f"{config.task} {NEXT}", initial=len(history), unit="epoch", disable=not progress
+    )
+    for epoch in itertools.count():
         started = time.perf_counter()
-        while rounds < wanted:
-            rounds += 1
-            made = problems.solve(out / f"paths_{rounds:04d}.npz", tried, model_of(state.variables))
-            examples = with_paths(robot, examples, num, made.home, made.q, made.length)
-            solved = len(made.q) / max(made.tried - tried, 1)
-            num, tried = num + len(made.q), made.tried
-        if is_old:
-            epoch += 1
+        rounds = max(0, (epoch - settings.epochs) // settings.round_epochs + 1)
+        is_new = epoch >= len(history)
+        late = before_s + started - began > 60 * settings.minutes
+        nothing_new = rounds > data.rounds and data.tried >= settings.problems
+        if is_new and (late or nothing_new):
+            break
+        while data.rounds < rounds:
+            file = out / f"paths_{data.rounds + 1:04d}.npz"
+            data = data.after(robot, problems.solve(file, data.tried, model_of(state.variables)))
+        if not is_new:
             continue
-        chosen = np.concatenate([training, np.arange(num_expert, num)])
-        order = np.random.default_rng([settings.seed, epoch]).permutation(chosen)
         losses = []
-        for part in order[: len(order) // size * size].reshape(-1, size):
-            state, loss = update(state, examples, jnp.asarray(part))
+        for chosen in data.batches([settings.seed, epoch]):
+            state, loss = update(state, data.examples, jnp.asarray(chosen))
             losses.append(loss)
-        figures = _validated(evaluate, state.variables, examples, validation, size)
+        figures = _validated(evaluate, state.variables, data)
         if not np.isfinite(figures["loss"]):
             store.close()
             raise RuntimeError(
                 f"training diverged in epoch {epoch}: the best epoch before is kept in '{out}'; "
                 "lower --learning-rate and choose another folder with --out"
             )
-        history.append(
-            {
-                "epoch": epoch,
-                "train_loss": float(np.mean(jax.device_get(losses))),
-                **figures,
-                "problems": tried,
-                "paths": num - num_expert,
-                "solved": solved,
-                "seconds": round(time.perf_counter() - started, 2),
-            }
-        )
+        row = {"epoch": epoch, "train_loss": float(np.mean(jax.device_get(losses))), **figures}
+        row |= {"problems": data.tried, "paths": data.num - data.num_expert}
+        row |= {"solved": data.solved, "seconds": round(time.perf_counter() - started, 2)}
+        history.append(row)
         if epochs_since_best(history) == 0:
             best = jax.device_get(state.variables)
             save_model(model_of(best), out / "model.npz")
         store.save(state, best, history, last=True)
         write_log(history, out)
         bar.update()
-        bar.set_postfix_str(f"loss {figures['loss']:.3f}, {tried} problems, {solved:.0%} solved")
-        epoch += 1
+        bar.set_postfix_str(f"loss {figures['loss']:.3f}, {data.solved:.0%} of problems solved")
     bar.close()
     store.close()
     model = model_of(best)
@@ -216,85 +149,74 @@ def train_online(
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Found:
-    """The paths that a round found."""
+class _Data:
+    """The paths so far: the expert's, and those that the planner found."""
 
-    home: np.ndarray  # (n,)
-    q: np.ndarray  # (n, K, D)
-    length: np.ndarray  # (n,) [m]
-    tried: int  # problems up to the end of the round
+    examples: PathExamples
+    training: np.ndarray  # indices of the expert's paths to train on
+    validation: np.ndarray  # and of those in homes held out
+    training_homes: np.ndarray
+    size: int  # paths of a batch
+    num_expert: int
+    num: int  # paths in all
+    tried: int = 0  # problems
+    rounds: int = 0
+    solved: float = 0.0  # share of the last round's problems
 
-
-class _Problems:
-    """Long queries in the training homes, and the planner that tries them."""
-
-    def __init__(
-        self, robot: MobileRobot, dataset: Dataset, homes: np.ndarray, settings: OnlineConfig
-    ):
-        """Take these homes of a data set in turn; nothing is drawn before it is needed."""
-        self.robot, self.dataset, self.homes, self.settings = robot, dataset, homes, settings
-        self._drawn: dict[int, Any] = {}
-
-    def solve(self, file: Path, first: int, model: Model) -> _Found:
-        """Try problems from ``first`` on, until their paths have enough states; or read the file."""
-        settings = self.settings
-        num_states = self.dataset.settings.waypoints + 2
-        if file.exists():
-            with np.load(file) as saved:
-                arrays = {name: saved[name] for name in ("home", "q", "length")}
-                return _Found(**arrays, tried=int(saved["tried"]))
-        homes, paths, lengths, problem = [], [], [], first
-        while problem < settings.problems and len(paths) * (num_states - 1) < settings.states:
-            home, world, path = self._solved(problem, model)
-            problem += 1
-            if path is not None:
-                states, length = even_states(world, path, num_states)
-                for column, value in zip(
-                    (homes, paths, lengths), (home, states, length), strict=True
-                ):
-                    column.append(value)
-        found = _Found(
-            home=np.array(homes, np.int32),
-            q=np.array(paths, np.float32).reshape(-1, num_states, self.robot.num_joints),
-            length=np.array(lengths, np.float32),
-            tried=problem,
+    @classmethod
+    def of(
+        cls, config: ModelConfig, robot: MobileRobot, dataset: Dataset, settings: OnlineConfig
+    ) -> "_Data":
+        """The expert's paths, with room for one of each problem."""
+        examples = path_examples(config, robot, dataset, settings.problems)
+        num = len(dataset) // dataset.settings.waypoints
+        home = np.asarray(examples.home)[:num]
+        split = TrainConfig(seed=settings.seed, validation=settings.validation)
+        training, validation = split_by_home(home, split)
+        size = max(settings.batch // (examples.q.shape[1] - 1), 1)
+        return cls(
+            examples=examples,
+            training=training,
+            validation=validation,
+            training_homes=np.unique(home[training]),
+            size=min(size, len(training)),
+            num_expert=num,
+            num=num,
         )
-        with replacing(file) as handle:
-            np.savez_compressed(handle, **vars(found))
-        return found
 
-    def _solved(self, problem: int, model: Model) -> tuple[int, Any, np.ndarray | None]:
-        """The home of a problem, its world, and the path (P, D) that was found, if any."""
-        settings, robot = self.settings, self.robot
-        home = int(self.homes[problem % len(self.homes)])
-        world, starts, goals = self._of_home(home)
-        start, goal = (q[problem // len(self.homes)] for q in (starts, goals))
-        key = jax.random.fold_in(jax.random.key(settings.seed), problem)
-        planner = PlannerConfig(goal_bias=0.1, lanes=settings.lanes)
-        policy: Any = policy_of(NEXT, robot, world, make_sampler(model), planner, (start, goal))
-        share = jnp.float32(settings.explored_in(problem))
-        policy = dataclasses.replace(policy, explored_share=share)
-        target = ConfigurationGoal(q=jnp.asarray(goal))
-        iterations = -(-settings.expansions // settings.lanes)
-        room = 1 << (iterations * settings.lanes + 1).bit_length()
-        tree = policy.init(world, target, start[None], room)
-        rule = make_termination(policy.goal_score(target), max_iterations=iterations)
-        found = search(world, target, policy, tree, key=key, termination=rule)
-        if not np.isfinite(found.history[-1, COST]):
-            return home, world, None
-        return home, world, policy.extract_path(found.tree)
+    def after(self, robot: MobileRobot, found: FoundPaths) -> "_Data":
+        """With what a round found."""
+        added = found.home, found.q, found.length
+        return dataclasses.replace(
+            self,
+            examples=with_paths(robot, self.examples, self.num, *added),
+            num=self.num + len(found.q),
+            solved=len(found.q) / max(found.tried - self.tried, 1),
+            tried=found.tried,
+            rounds=self.rounds + 1,
+        )
 
-    def _of_home(self, home: int) -> tuple[Any, np.ndarray, np.ndarray]:
-        """A home's world, with checks as fine as such a planner's, and all its starts and goals."""
-        if home not in self._drawn:
-            grid = self.dataset.grids[home]
-            grid = grid.flatten() if self.robot.planar else grid
-            world = build_world(self.robot, grid)
-            num = -(-self.settings.problems // len(self.homes))
-            ends = long_queries(self.robot, world, grid, num, self.settings.seed)
-            world = dataclasses.replace(world, resolution=world.resolution / 2)
-            self._drawn[home] = (world, *ends)
-        return self._drawn[home]
+    def batches(self, seed: list[int]) -> np.ndarray:
+        """All paths to train on, in a random order, as batches (k, size)."""
+        chosen = np.concatenate([self.training, np.arange(self.num_expert, self.num)])
+        order = np.random.default_rng(seed).permutation(chosen)
+        return order[: len(order) // self.size * self.size].reshape(-1, self.size)
+
+
+def _network(
+    config: ModelConfig, robot: MobileRobot, examples: PathExamples, settings: OnlineConfig
+) -> tuple[Any, optax.GradientTransformation, State]:
+    """The network, its optimizer and a random state."""
+    module = build_module(config, robot.num_joints)
+    optimizer = optax.chain(
+        optax.add_decayed_weights(settings.weight_decay), optax.adam(settings.learning_rate)
+    )
+    shapes = jax.eval_shape(partial(path_batch, config, robot), examples, jnp.zeros(1, jnp.int32))
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    key = jax.random.key(settings.seed)
+    variables: Any = jax.jit(module.init)(key, zeros.image, zeros.goal, zeros.q)
+    state = State(variables=variables, optimizer=optimizer.init(variables), step=jnp.int32(0))
+    return module, optimizer, state
 
 
 def _programs(
@@ -325,16 +247,11 @@ def _programs(
     return update, evaluate
 
 
-def _validated(
-    evaluate: Callable[..., Any],
-    variables: Any,
-    examples: PathExamples,
-    chosen: np.ndarray,
-    size: int,
-) -> dict[str, float]:
-    """Loss and errors on chosen paths (n,); the quality is minus the squared error of actions."""
-    parts = np.resize(chosen, (-(-len(chosen) // size), size))
-    found = [jax.device_get(evaluate(variables, examples, jnp.asarray(p))) for p in parts]
+def _validated(evaluate: Callable[..., Any], variables: Any, data: _Data) -> dict[str, float]:
+    """Loss and errors in homes held out; the quality is minus the squared error of actions."""
+    chosen = data.validation
+    parts = np.resize(chosen, (-(-len(chosen) // data.size), data.size))
+    found = [jax.device_get(evaluate(variables, data.examples, jnp.asarray(p))) for p in parts]
     loss = float(np.mean([part[0] for part in found]))
     action, value = (float(np.mean([part[1][k] for part in found])) for k in (0, 1))
     return {"loss": loss, "quality": -action, "value_error": value**0.5}

@@ -29,7 +29,7 @@ NRP_ROOMS = (
     ("learning",),
     ("samplers", "generators", "guides", "retrieval"),
     ("planners",),
-    ("planner", "problems", "online"),
+    ("planner", "problems", "online", "online_problems"),
     ("viz", "viewer"),
     ("bench",),
     ("cli",),

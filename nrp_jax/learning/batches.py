@@ -8,7 +8,7 @@ queries of a batch, ``D`` joints, ``F`` link frames, ``E`` features.
 
 import functools
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,30 +27,6 @@ from vrrt_jax.core.types import pytree
 # Each query that is turned by itself is turned by all quarters, of which one is kept.
 LARGE_IMAGE = 100_000  # cells
 LIMITS = np.array([[4], [2]])  # of quarter turns, and of mirrors
-
-
-class Queries(Protocol):
-    """What examples have in common: K configurations of each query, its start the first."""
-
-    @property
-    def maps(self) -> jax.Array:
-        """(H, X + 40, Y + 40, Z) float16, see :func:`surrounding_map`."""
-        ...
-
-    @property
-    def home(self) -> jax.Array:
-        """(Q,) i32."""
-        ...
-
-    @property
-    def q(self) -> jax.Array:
-        """(Q, K, D) configurations."""
-        ...
-
-    @property
-    def points(self) -> jax.Array:
-        """(Q, K, F, 3) positions of their link frames [m]."""
-        ...
 
 
 @pytree
@@ -263,13 +239,14 @@ def make_batch(
 def local_queries(
     config: ModelConfig,
     robot: MobileRobot,
-    examples: "Queries",
+    examples: Any,
     chosen: jax.Array,
     key: jax.Array | None,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Images (n, X, Y, Z), configurations (n, K, D) and link frames (n, K, F, 3), all local.
 
-    Arguments are those of :func:`make_batch`.
+    Arguments are those of :func:`make_batch`; examples have ``maps``, ``home``, ``q`` (Q, K, D) and
+    ``points`` (Q, K, F, 3), as :class:`Examples` do.
     """
     image, q, points = jax.vmap(lambda index: _local(config, examples, index))(chosen)
     if key is not None:
@@ -301,7 +278,7 @@ def describe(config: ModelConfig, robot: MobileRobot, q: jax.Array, points: jax.
     return jax.vmap(jax.vmap(one))(q, points)
 
 
-def _local(config: ModelConfig, examples: "Queries", index: jax.Array):
+def _local(config: ModelConfig, examples: Any, index: jax.Array):
     """Image, configurations (K, D) and link frames of one query, in its local frame."""
     home, q, points = examples.home[index], examples.q[index], examples.points[index]
     if config.scope == "window":

@@ -1,8 +1,9 @@
 """NEXT's network: it plans on a small picture of the map, and reads the plan where a robot stands.
 
 After Chen, Dai, Lin, Ye, Liu and Song, "Learning to Plan in High Dimensions via Neural
-Exploration-Exploitation Trees" (ICLR 2020). Letters: ``n`` queries, ``C`` configurations of a query,
-``E`` features, ``W`` cells of the small map, ``A`` channels of attention, ``G`` features of each.
+Exploration-Exploitation Trees" (ICLR 2020). Letters: ``n`` queries, ``C`` configurations of a
+query, ``E`` features, ``W`` cells of the small map, ``A`` channels of attention, ``G`` features of
+each.
 """
 
 import flax.linen as nn

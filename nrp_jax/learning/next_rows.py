@@ -1,7 +1,7 @@
 """What NEXT learns from: paths as states, each with the next state and the length that is left.
 
-Letters: ``Q`` queries, ``n`` queries of a batch, ``K`` states of a path with both ends, ``H`` homes,
-``D`` joints, ``F`` link frames, ``E`` features.
+Letters: ``Q`` queries, ``n`` queries of a batch, ``K`` states of a path with both ends, ``H``
+homes, ``D`` joints, ``F`` link frames, ``E`` features.
 """
 
 import dataclasses

@@ -36,9 +36,9 @@ class NEXTPlanner(RRTStar):
     """RRT* most of whose expansions follow a guide.
 
     A lane chooses the node with the highest upper confidence bound: its value and, the more the
-    fewer nodes are around it, a bonus. It draws candidates around the step that the guide takes from
-    there, and goes to the one whose bound is highest. Lanes choose one after the other, as if the
-    children of those before were there. The other lanes are those of RRT*.
+    fewer nodes are around it, a bonus. It draws candidates around the step that the guide takes
+    from there, and goes to the one whose bound is highest. Lanes choose one after the other, as if
+    the children of those before were there. The other lanes are those of RRT*.
     """
 
     guide: Any  # of a query, see :mod:`nrp_jax.guides`
@@ -151,13 +151,13 @@ class NEXTPlanner(RRTStar):
     def _kernel(self, world: GridWorld, nodes: jax.Array, q: jax.Array) -> jax.Array:
         """The Gaussian kernel (n, N) of ``q`` (n, D) and nodes (N, D).
 
-        Its distance is that of a base that slides: lengths of curves would cost more than they tell.
+        Its distance is that of a base that slides: curves would cost more than they tell.
         """
         apart = GridWorld.distances(world, nodes, q, jnp.array(True))
         return jnp.exp(-((apart / self.radius) ** 2))
 
     def _within_radius(self, world: GridWorld, q: jax.Array, target: jax.Array) -> jax.Array:
-        """Targets (B, D), moved towards ``q`` (B, D) to where edges are no longer than the radius."""
+        """Targets (B, D), moved towards ``q`` (B, D) until edges are no longer than the radius."""
         edge = world.edge(q, target)
         share = self.radius / jnp.maximum(world.length(edge), 1e-9)
         short = world.normalize(world.end(q, world.truncate(edge, jnp.minimum(share, 1.0))))
