@@ -30,7 +30,7 @@ class QueryGuide:
     plan: jax.Array  # (1, W, A, G) on the small map
     goal: jax.Array  # (1, E) features
     center: jax.Array  # (2,) origin of the network's frame in the map [m]
-    sigma: Any = 0.1  # () standard deviation of actions around the network's [m] and [rad]
+    sigma: Any  # () standard deviation of steps around the network's [m] and [rad]
     config: ModelConfig = static()
 
     def predict(self, world: GridWorld, q: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -58,6 +58,7 @@ class NEXTGuide:
 
     robot: MobileRobot
     variables: Any  # weights, flax variables
+    sigma: Any = 0.3  # () standard deviation of steps around the network's [m] and [rad]
     config: ModelConfig = static()
     num_outputs: int = static()  # joints
 
@@ -79,7 +80,7 @@ def _look(guide: NEXTGuide, world: GridWorld, q_start: jax.Array, q_goal: jax.Ar
         plan=plan,
         goal=inputs.goal,
         center=inputs.center[0],
-        sigma=jnp.float32(0.1),
+        sigma=guide.sigma,
         config=config,
     )
 

@@ -106,7 +106,7 @@ def train_online(
         started = time.perf_counter()
         rounds = max(0, (epoch - settings.epochs) // settings.round_epochs + 1)
         is_new = epoch >= len(history)
-        late = before_s + started - began > 60 * settings.minutes
+        late = epoch > 0 and before_s + started - began > 60 * settings.minutes
         nothing_new = rounds > data.rounds and data.tried >= settings.problems
         if is_new and (late or nothing_new):
             break

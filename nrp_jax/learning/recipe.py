@@ -64,7 +64,7 @@ class OnlineConfig:
     least_explored: float = setting(0.1, 0.0, 1.0)  # and in the last ones, by tenths
     lanes: int = setting(32, 1, 4096)  # expansions at a time
     validation: float = 0.15  # share of the homes that is held out
-    minutes: float = setting(1e6, 0.0, endless=True)  # no epoch begins after so many
+    minutes: float = setting(1e6, 0.0, endless=True)  # no epoch but the first begins after so many
     seed: int = setting(0, 0, 2**31)
 
     @classmethod

@@ -45,8 +45,9 @@ class NEXTPlanner(RRTStar):
     explored_share: Any = (
         0.1  # () share of lanes that are RRT*'s, beside those that aim at the goal
     )
-    bonus: Any = 1.0  # () weight of the density's part of the bound [m]
-    radius: Any = 2.0  # () longest edge, and width of the kernel [m]
+    bonus: Any = 10.0  # () weight of the density's part of the bound [m]
+    radius: Any = 2.0  # () longest edge [m]
+    width: Any = 0.5  # () of the kernel [m]
     candidates: int = static(default=10)  # C
 
     def init(self, world: GridWorld, goal: ConfigurationGoal, q_roots: Any, capacity: int) -> Tree:
@@ -109,7 +110,8 @@ class NEXTPlanner(RRTStar):
         expansion: Expansion,
     ) -> Tree:
         """Count what was tried, and rewire."""
-        tried = jnp.where(expansion.accepted[:, None], expansion.q, proposals.target)
+        # What failed counts where it began, so that the next lanes begin elsewhere.
+        tried = jnp.where(expansion.accepted[:, None], expansion.q, tree.q[proposals.parent])
         near = self._kernel(world, tree.q, tried)  # (B, N)
         density = tree.payload.density + jnp.sum(near, axis=0)
         # New nodes count all that are in the tree, themselves and each other included.
@@ -154,7 +156,7 @@ class NEXTPlanner(RRTStar):
         Its distance is that of a base that slides: curves would cost more than they tell.
         """
         apart = GridWorld.distances(world, nodes, q, jnp.array(True))
-        return jnp.exp(-((apart / self.radius) ** 2))
+        return jnp.exp(-((apart / self.width) ** 2))
 
     def _within_radius(self, world: GridWorld, q: jax.Array, target: jax.Array) -> jax.Array:
         """Targets (B, D), moved towards ``q`` (B, D) until edges are no longer than the radius."""
