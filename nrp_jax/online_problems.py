@@ -24,6 +24,7 @@ from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import build_world
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.goal import ConfigurationGoal
+from vrrt_jax.core.interrupt import uninterrupted
 from vrrt_jax.core.search import COST, make_termination, search
 
 
@@ -94,7 +95,8 @@ class Problems:
         room = 1 << (iterations * settings.lanes + 1).bit_length()
         tree = policy.init(world, target, start[None], room)
         rule = make_termination(policy.goal_score(target), max_iterations=iterations)
-        found = search(world, target, policy, tree, key=key, termination=rule)
+        with uninterrupted():
+            found = search(world, target, policy, tree, key=key, termination=rule)
         if not np.isfinite(found.history[-1, COST]):
             return home, world, None
         return home, world, policy.extract_path(found.tree)
