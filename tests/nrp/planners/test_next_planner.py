@@ -28,7 +28,7 @@ class EastGuide:
 
     def predict(self, world, q):
         """See :class:`nrp_jax.guides.QueryGuide`."""
-        return jnp.zeros_like(q).at[:, 0].set(0.5), q[:, 0]
+        return jnp.zeros_like(q).at[:, 0].set(0.25), q[:, 0]
 
     def draw(self, world, q, action, num, key):
         """See :class:`nrp_jax.guides.QueryGuide`."""
@@ -50,18 +50,8 @@ def home(snake):
     return grid, nrp_jax.build_world(snake, grid)
 
 
-def grown(world, policy, iterations):
-    """The trees after each iteration."""
-    goal = nrp_jax.ConfigurationGoal(q=jnp.asarray(GOAL))
-    trees = [policy.init(world, goal, START[None], 256)]
-    step = jax.jit(expand)
-    for _ in range(iterations):
-        trees.append(step(world, goal, policy, trees[-1], jax.random.key(0)))
-    return trees
-
-
 def test_it_follows_its_guide_to_the_wall_and_counts_what_failed(home):
-    """One lane goes east in steps of half a meter, and is blocked where the wall is."""
+    """One lane goes east in steps of a quarter of a meter, until the wall blocks it."""
     policy = NEXTPlanner(
         guide=EastGuide(),
         lanes=1,
@@ -69,28 +59,24 @@ def test_it_follows_its_guide_to_the_wall_and_counts_what_failed(home):
         explored_share=jnp.float32(0.0),
         bonus=jnp.float32(0.01),
     )
-    before, *trees = grown(home[1], policy, 6)
-    last = trees[-1]
-    q = np.asarray(last.q)[: int(last.size)]
-    # The first expansion of all aims at the goal; its edge of two meters is blocked.
-    assert int(trees[0].size) == 1
-    np.testing.assert_allclose(q[:3, 0], [1.0, 1.5, 2.0], atol=1e-5)
-    np.testing.assert_allclose(q[:, 1:], np.broadcast_to(START[1:], q[:, 1:].shape), atol=1e-5)
-    assert int(last.size) == 3
-    # The densities of nodes: a Gaussian around all that was tried, failed or not.
-    assert np.asarray(before.payload.density)[0] == 1.0
-    east = [START + [x, 0, 0, 0, 0, 0, 0, 0] for x in (0.0, 0.5, 1.0, 1.5, 1.5, 1.5)]
-    toward_goal = world_step(home[1], START, GOAL, 2.0)
-    tried = np.stack([*east, toward_goal]).astype(np.float32)
-    apart = np.asarray(GridWorld.distances(home[1], tried, q[:1], jnp.array(True)))
-    expected = np.exp(-((apart / 2.0) ** 2)).sum()
-    np.testing.assert_allclose(np.asarray(last.payload.density)[0], expected, rtol=1e-4)
-
-
-def world_step(world, q, target, length):
-    """Where an edge towards a target is so long."""
-    share = length / float(world.distance(q, target))
-    return np.asarray(world.interpolate(q, target, jnp.float32(share)))
+    # The first expansion of all aims at the goal, and goes two meters at most.
+    start, turned = START, np.array([0, 0, 0, 0, 0, 0, 0, 0.5], np.float32)
+    goal = nrp_jax.ConfigurationGoal(q=jnp.asarray(start - turned))
+    tree = policy.init(home[1], goal, start[None], 64)
+    assert np.asarray(tree.payload.density)[0] == 1.0
+    step = jax.jit(expand)
+    for _ in range(7):
+        tree = step(home[1], goal, policy, tree, jax.random.key(0))
+    size = int(tree.size)
+    q, rejected = np.asarray(tree.q)[:size], int(tree.rejected.sum())
+    east = q[np.isclose(q[:, -1], start[-1], atol=1e-5)]
+    assert len(east) >= 2 and rejected >= 2 and size + rejected == 8
+    np.testing.assert_allclose(np.diff(east[:, 0]), 0.25, atol=1e-5)
+    # Densities are Gaussians around all nodes, and around where failed expansions began: the last.
+    tried = np.concatenate([q, np.repeat(east[-1:], rejected, axis=0)])
+    apart = np.asarray(GridWorld.distances(home[1], tried, q, jnp.array(True)))
+    expected = np.exp(-((apart / 0.5) ** 2)).sum(axis=1)
+    np.testing.assert_allclose(np.asarray(tree.payload.density)[:size], expected, rtol=1e-4)
 
 
 def test_lanes_choose_one_after_the_other(home):
