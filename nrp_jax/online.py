@@ -37,7 +37,6 @@ from nrp_jax.learning.training_io import (
     CheckpointStore,
     State,
     claim_output_dir,
-    epochs_since_best,
     plot_curves,
     write_log,
 )
@@ -67,8 +66,8 @@ def train_online(
         config: the architecture.
         robot: whose configurations the paths hold.
         dataset: of paths, from :func:`nrp_jax.learning.data.load_dataset`.
-        out: folder for ``model.npz`` (the epoch that is best on the expert's paths in homes held
-            out), ``log.csv``, ``curves.png``, ``checkpoint/`` and the paths that were found.
+        out: folder for ``model.npz`` (the last epoch, as published), ``log.csv``, ``curves.png``,
+            ``checkpoint/`` and the paths that were found.
         settings: of the training; the published ones if None.
         stamp: names the data; a training goes on only with the same.
         progress: show a progress bar.
@@ -87,7 +86,7 @@ def train_online(
     out = claim_output_dir(Path(out), parts)
     module, optimizer, state = _network(config, robot, data.examples, settings)
     store = CheckpointStore(out / "checkpoint")
-    state, best, history = store.restore(state)
+    state, _, history = store.restore(state)
     update, evaluate = _programs(config, robot, module, optimizer, settings)
     problems = Problems(robot, dataset, data.training_homes, settings)
     before_s = sum(row["seconds"] for row in history)
@@ -95,7 +94,7 @@ def train_online(
     def model_of(variables: Any) -> Model:
         info: dict[str, Any] = {"num_outputs": robot.num_joints, "data": stamp}
         if history:
-            info["best"] = min(history, key=lambda row: row["loss"])
+            info["last"] = history[-1]
         return Model(config=config, variables=variables, info=info)
 
     # Epochs on the expert's paths, then rounds of problems, each with epochs on all paths.
@@ -123,23 +122,21 @@ def train_online(
         if not np.isfinite(figures["loss"]):
             store.close()
             raise RuntimeError(
-                f"training diverged in epoch {epoch}: the best epoch before is kept in '{out}'; "
+                f"training diverged in epoch {epoch}: the epoch before is kept in '{out}'; "
                 "lower --learning-rate and choose another folder with --out"
             )
         row = {"epoch": epoch, "train_loss": float(np.mean(jax.device_get(losses))), **figures}
         row |= {"problems": data.tried, "paths": data.num - data.num_expert}
         row |= {"solved": data.solved, "seconds": round(time.perf_counter() - started, 2)}
         history.append(row)
-        if epochs_since_best(history) == 0:
-            best = jax.device_get(state.variables)
-            save_model(model_of(best), out / "model.npz")
-        store.save(state, best, history, last=True)
+        save_model(model_of(state.variables), out / "model.npz")
+        store.save(state, jax.device_get(state.variables), history, last=True)
         write_log(history, out)
         bar.update()
         bar.set_postfix_str(f"loss {figures['loss']:.3f}, {data.solved:.0%} of problems solved")
     bar.close()
     store.close()
-    model = model_of(best)
+    model = model_of(state.variables)
     save_model(model, out / "model.npz")
     try:
         plot_curves(history, out / "curves.png", f"{config.task} {config.kind}")
@@ -292,6 +289,6 @@ def _run_command(others: Callable[..., int], arguments: argparse.Namespace) -> i
     except KeyboardInterrupt:
         print(f"the same command goes on from the last epoch in {arguments.out}")
         raise
-    figures = ", ".join(f"{name} {value:.4g}" for name, value in model.info["best"].items())
+    figures = ", ".join(f"{name} {value:.4g}" for name, value in model.info["last"].items())
     print(f"wrote {Path(arguments.out) / 'model.npz'}: {figures}")
     return 0

@@ -27,7 +27,7 @@ CONFIG = dataclasses.replace(
     ModelConfig.default("snake", "next"), channels=(4, 8), attention=2, latent=4, iterations=2
 )
 SETTINGS = OnlineConfig(
-    epochs=2, batch=40, problems=6, states=5, round_epochs=1, expansions=320, learning_rate=1e-2
+    epochs=2, batch=40, problems=3, states=5, round_epochs=1, expansions=320, learning_rate=1e-2
 )
 
 
@@ -100,25 +100,16 @@ def test_the_published_network_reads_its_plan_at_each_configuration():
 def test_it_learns_from_paths_and_goes_on_where_it_was(
     robot, dataset, tmp_path, monkeypatch, capsys
 ):
-    """Interrupted after two epochs it ends as a training in one go."""
+    """Stopped after one epoch and begun again, it ends as a training in one go."""
     whole = train_online(CONFIG, robot, dataset, tmp_path / "a", settings=SETTINGS, progress=False)
     log = list(csv.DictReader((tmp_path / "a" / "log.csv").read_text().splitlines()))
     assert [float(row["problems"]) for row in log[:2]] == [0, 0]
-    assert float(log[-1]["problems"]) == 6 and float(log[-1]["paths"]) > 0
+    assert float(log[-1]["problems"]) == 3 and float(log[-1]["paths"]) > 0
     assert float(log[-1]["train_loss"]) < float(log[0]["train_loss"])
-    # The same, whose time is up after one epoch, and which is interrupted after two.
+    # The same, whose time is up after one epoch, and then not.
     short = dataclasses.replace(SETTINGS, minutes=0.0)
     train_online(CONFIG, robot, dataset, tmp_path / "b", settings=short, progress=False)
     assert len((tmp_path / "b" / "log.csv").read_text().splitlines()) == 2
-    solve = online.Problems.solve
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(online.Problems, "solve", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        train_online(CONFIG, robot, dataset, tmp_path / "b", settings=SETTINGS, progress=False)
-    monkeypatch.setattr(online.Problems, "solve", solve)
     again = train_online(CONFIG, robot, dataset, tmp_path / "b", settings=SETTINGS, progress=False)
     for a, b in zip(*(jax.tree.leaves(m.variables) for m in (whole, again)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4)
