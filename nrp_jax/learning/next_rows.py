@@ -147,7 +147,8 @@ def next_loss(
     module: PlanningNetwork, variables: Any, batch: PathBatch, value_weight: float
 ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
     """The loss (), and the mean squared errors of actions and of values, both ()."""
-    action, value = module.apply(variables, batch.image, batch.goal, batch.q)
+    answers: Any = module.apply(variables, batch.image, batch.goal, batch.q)
+    action, value = answers
     of_action = jnp.mean((action - batch.action) ** 2)
     of_value = jnp.mean((value - batch.value) ** 2)
     return of_action + value_weight * of_value, (of_action, of_value)

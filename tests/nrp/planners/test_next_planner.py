@@ -74,7 +74,8 @@ def test_it_follows_its_guide_to_the_wall_and_counts_what_failed(home):
     np.testing.assert_allclose(np.diff(east[:, 0]), 0.25, atol=1e-5)
     # Densities are Gaussians around all nodes, and around where failed expansions began: the last.
     tried = np.concatenate([q, np.repeat(east[-1:], rejected, axis=0)])
-    apart = np.asarray(GridWorld.distances(home[1], tried, q, jnp.array(True)))
+    everywhere = jnp.asarray(tried), jnp.asarray(q), jnp.array(True)
+    apart = np.asarray(GridWorld.distances(home[1], *everywhere))
     expected = np.exp(-((apart / 0.5) ** 2)).sum(axis=1)
     np.testing.assert_allclose(np.asarray(tree.payload.density)[:size], expected, rtol=1e-4)
 
