@@ -18,6 +18,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
+    from nrp_jax import online
     from nrp_jax.bench import checks, curves, execution, planning, report, score
     from nrp_jax.homes import figure
     from nrp_jax.learning import data, train
@@ -26,7 +27,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="nrp", description="Motion planning in homes, with learned samplers."
     )
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (figure, data, train, score, report):
+    for module in (figure, data, train, online, score, report):
         module.add_arguments(commands)
     _add_plan(commands)
     view = commands.add_parser("view", help="show a plan in the browser")
@@ -54,8 +55,8 @@ def _add_plan(commands) -> None:
         "--method",
         help="nrp-connect (default), rrt, rrt-is, rrt-connect, cvae-rrt, nrp-d, nrp-g or, of the "
         "fetch, fire; or, to shorten the path until the budget ends, bit-star, rrt-star, "
-        "irrt-star, cvae-irrt-star, nrp-star-d, nrp-star-g, nrp-star-connect or, of the fetch, "
-        "fire-star or decomposed",
+        "irrt-star, cvae-irrt-star, next, nrp-star-d, nrp-star-g, nrp-star-connect or, of the "
+        "fetch, fire-star or decomposed",
     )
     plan.add_argument("--model", help="what nrp train wrote; packaged weights by default")
     plan.add_argument("--crop", type=command.numbers, help="plan in x0,y0,x1,y1 of the map [m]")

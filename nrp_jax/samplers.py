@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from nrp_jax.generators import CVAESampler, Generator, GlobalCVAESampler
+from nrp_jax.guides import NEXTGuide
 from nrp_jax.homes.grid import HEIGHT, RESOLUTION
 from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning import features
@@ -22,7 +23,7 @@ from nrp_jax.learning.checkpoint import Model, build_module, check_model, load_m
 from nrp_jax.learning.edge_check import first_free
 from nrp_jax.learning.experience_database import load_database
 from nrp_jax.learning.local_map import SIDE
-from nrp_jax.learning.models import FIRE, GLOBAL_CVAE, ModelConfig, check_choices
+from nrp_jax.learning.models import FIRE, GLOBAL_CVAE, NEXT, ModelConfig, check_choices
 from nrp_jax.learning.network_inputs import NetworkInputs, network_inputs
 from nrp_jax.retrieval import ExperienceSampler
 from nrp_jax.scene.robots import MobileRobot, batch_link_features, load_robot
@@ -195,7 +196,7 @@ def make_sampler(model: Model, **settings: Any) -> Any:
     shared = {"robot": robot, "variables": model.variables, "config": config, **settings}
     if config.kind == "discriminator":
         return DiscriminatorSampler(**shared)
-    make = GlobalCVAESampler if config.kind == GLOBAL_CVAE else CVAESampler
+    make = {GLOBAL_CVAE: GlobalCVAESampler, NEXT: NEXTGuide}.get(config.kind, CVAESampler)
     return make(num_outputs=model.info["num_outputs"], **shared)
 
 
@@ -210,14 +211,14 @@ def load_sampler(task: str, kind: str, path: str | Path | None = None, **setting
 
     Args:
         task: "snake" or "fetch".
-        kind: "discriminator", "cvae", "global-cvae" or "fire".
+        kind: "discriminator", "cvae", "global-cvae", "next" or "fire".
         path: a folder that ``nrp train`` wrote, or the ``model.npz`` in it; the packaged weights
             if None.
         settings: fields of the sampler's class, such as ``num_edge_checked``.
 
     Returns:
-        A :class:`DiscriminatorSampler`, :class:`CVAESampler`, :class:`GlobalCVAESampler` or
-        :class:`ExperienceSampler`.
+        A :class:`DiscriminatorSampler`, :class:`CVAESampler`, :class:`GlobalCVAESampler`,
+        :class:`NEXTGuide` or :class:`ExperienceSampler`.
 
     Raises:
         ValueError: there is no such model, or it is for another task or of another kind.
@@ -239,14 +240,14 @@ def check_fits(sampler: Any, robot: MobileRobot, world: GridWorld, kind: str) ->
         sampler: any sampler; of other classes only the method that planners call is checked.
         robot: to plan for.
         world: the robot in a home.
-        kind: "discriminator", "cvae", "global-cvae" or "fire", which the planner needs.
+        kind: "discriminator", "cvae", "global-cvae", "next" or "fire", which the planner needs.
 
     Raises:
         ValueError: the sampler is of another task or kind, or the map's cells are others than those
             that the networks were trained on, or more than a network of whole maps can see.
     """
-    if not isinstance(sampler, DiscriminatorSampler | Generator | ExperienceSampler):
-        method = {GLOBAL_CVAE: "draw", FIRE: "retrieve"}.get(kind, "propose")
+    if not isinstance(sampler, DiscriminatorSampler | Generator | NEXTGuide | ExperienceSampler):
+        method = {GLOBAL_CVAE: "draw", NEXT: "of_query", FIRE: "retrieve"}.get(kind, "propose")
         if not hasattr(sampler, method):
             raise ValueError(
                 f"the sampler, a {type(sampler).__name__}, has no method {method}; expected one as "

@@ -140,6 +140,7 @@ def add_arguments(subparsers: Any) -> None:
     parser.add_argument("--discriminator", help="what nrp train wrote; packaged by default")
     parser.add_argument("--cvae", help="what nrp train wrote; packaged by default")
     parser.add_argument("--global-cvae", help="what nrp train wrote; packaged by default")
+    parser.add_argument("--next", help="what nrp train wrote; packaged by default")
     parser.add_argument("--fire", help="what nrp train wrote; packaged by default")
     parser.add_argument(
         "--seed", type=command.whole(0, 100_000), default=0, help="of the homes, as for nrp data"

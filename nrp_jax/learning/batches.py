@@ -8,6 +8,7 @@ queries of a batch, ``D`` joints, ``F`` link frames, ``E`` features.
 
 import functools
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning import features, local_map
 from nrp_jax.learning.data import Dataset
 from nrp_jax.learning.expert import GOOD_RATIO
-from nrp_jax.learning.models import GLOBAL_CVAE, ModelConfig
+from nrp_jax.learning.models import MAP_KINDS, ModelConfig
 from nrp_jax.scene.field import DistanceField, make_field
 from nrp_jax.scene.robots import MobileRobot, batch_link_features
 from vrrt_jax.core.types import pytree
@@ -125,7 +126,7 @@ def load_examples(
             f"the data set is of task '{dataset.settings.task}', the model of '{config.task}'; "
             "give another data set, or the other --task"
         )
-    if dataset.settings.paths != (config.kind == GLOBAL_CVAE):
+    if dataset.settings.paths != (config.kind in MAP_KINDS):
         holds, option = ("paths", "without") if dataset.settings.paths else ("waypoints", "with")
         raise ValueError(
             f"the data set holds {holds}, but a '{config.kind}' learns from other rows; give one "
@@ -164,7 +165,7 @@ def make_examples(
         target: (n,) how good the waypoints are.
         weight: (n,) in the loss.
     """
-    maps = _stack([surrounding_map(config, make_field(grid)) for grid in grids], config)
+    maps = stacked_maps(config, grids)
     # Number the queries of all homes; ``group`` (n,) is the query of each row.
     _, first, group, counts = np.unique(
         rows["home"].astype(np.int64) << 32 | rows["query"].astype(np.int64),
@@ -192,8 +193,9 @@ def make_examples(
     )
 
 
-def _stack(maps: list[jax.Array], config: ModelConfig) -> np.ndarray:
-    """Maps of several sizes as one array (H, X, Y, Z), filled up with solid cells."""
+def stacked_maps(config: ModelConfig, grids: Sequence[Grid]) -> np.ndarray:
+    """Maps of homes of several sizes as one array (H, X, Y, Z), filled up with solid cells."""
+    maps = [surrounding_map(config, make_field(grid)) for grid in grids]
     size = np.max([one.shape for one in maps], axis=0)
     stacked = np.full((len(maps), *size), 1.0 if config.paper else 0.0, np.float16)
     for k, one in enumerate(maps):
@@ -219,7 +221,33 @@ def make_batch(
             ``LARGE_IMAGE`` cells all alike. Homes have no preferred direction, so that a query
             stands for eight.
     """
-    # Images, configurations and link frames in the local frames.
+    image, q, points = local_queries(config, robot, examples, chosen, key)
+    described = describe(config, robot, q, points)
+    return Batch(
+        image=image,
+        start=described[:, 0],
+        goal=jax.vmap(lambda q, p: features.goal_features(config, robot, q, p))(
+            q[:, 1], points[:, 1]
+        ),
+        waypoints=described[:, 2:],
+        relation=jax.vmap(functools.partial(relations, robot))(image, q, points),
+        target=examples.target[chosen],
+        weight=examples.weight[chosen],
+    )
+
+
+def local_queries(
+    config: ModelConfig,
+    robot: MobileRobot,
+    examples: Any,
+    chosen: jax.Array,
+    key: jax.Array | None,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Images (n, X, Y, Z), configurations (n, K, D) and link frames (n, K, F, 3), all local.
+
+    Arguments are those of :func:`make_batch`; examples have ``maps``, ``home``, ``q`` (Q, K, D) and
+    ``points`` (Q, K, F, 3), as :class:`Examples` do.
+    """
     image, q, points = jax.vmap(lambda index: _local(config, examples, index))(chosen)
     if key is not None:
         # One of the eight symmetries of a square for each query.
@@ -233,18 +261,7 @@ def make_batch(
         quarter, mirror = (jnp.broadcast_to(s, len(chosen)) for s in symmetry)
         q = jax.vmap(lambda *a: features.turn_configuration(robot, *a))(q, quarter, mirror)
         points = jax.vmap(features.turn_points)(points, quarter, mirror)
-    described = describe(config, robot, q, points)
-    return Batch(
-        image=image,
-        start=described[:, 0],
-        goal=jax.vmap(lambda q, p: features.goal_features(config, robot, q, p))(
-            q[:, 1], points[:, 1]
-        ),
-        waypoints=described[:, 2:],
-        relation=jax.vmap(functools.partial(relations, robot))(image, q, points),
-        target=examples.target[chosen],
-        weight=examples.weight[chosen],
-    )
+    return image, q, points
 
 
 def empty_batch(config: ModelConfig, robot: MobileRobot, examples: Examples) -> Batch:
@@ -261,8 +278,8 @@ def describe(config: ModelConfig, robot: MobileRobot, q: jax.Array, points: jax.
     return jax.vmap(jax.vmap(one))(q, points)
 
 
-def _local(config: ModelConfig, examples: Examples, index: jax.Array):
-    """Image, configurations (2 + W, D) and link frames of one query, in its local frame."""
+def _local(config: ModelConfig, examples: Any, index: jax.Array):
+    """Image, configurations (K, D) and link frames of one query, in its local frame."""
     home, q, points = examples.home[index], examples.q[index], examples.points[index]
     if config.scope == "window":
         image = local_map.stacked_window(examples.maps, home, q[0])

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nrp_jax.learning.models import CVAE, Discriminator, ModelConfig
+from nrp_jax.learning.models import CVAE, NEXT, Discriminator, ModelConfig
+from nrp_jax.learning.next_network import PlanningNetwork
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.precision import single_precision
 
@@ -28,13 +29,16 @@ class Model:
     info: dict[str, Any]  # "num_outputs", and how the model was trained, with its best epoch
 
 
-def build_module(config: ModelConfig, num_outputs: int) -> Discriminator | CVAE:
+def build_module(config: ModelConfig, num_outputs: int) -> Discriminator | CVAE | PlanningNetwork:
     """Build the flax module of a configuration.
 
     Args:
         config: the architecture.
-        num_outputs: features that a CVAE generates; unused for a discriminator.
+        num_outputs: features that a CVAE generates, or joints that NEXT moves; unused for a
+            discriminator.
     """
+    if config.kind == NEXT:
+        return PlanningNetwork(config, num_outputs)
     return Discriminator(config) if config.kind == "discriminator" else CVAE(config, num_outputs)
 
 

@@ -251,7 +251,9 @@ def add_arguments(subparsers) -> None:
     )
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument(
-        "--paths", action="store_true", help="states along whole paths, for --model global-cvae"
+        "--paths",
+        action="store_true",
+        help="states along whole paths, for --model global-cvae and --model next",
     )
     kind.add_argument(
         "--experiences", action="store_true", help="corners of shortened paths, for --model fire"

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nrp_jax.learning.models import GLOBAL_CVAE, ModelConfig
+from nrp_jax.learning.models import MAP_KINDS, ModelConfig
 from nrp_jax.scene.field import FINE, DistanceField
 from nrp_jax.scene.robots import MobileRobot
 from vrrt_jax.core.edges import short_way
@@ -58,8 +58,8 @@ def goal_features(
 ) -> jax.Array:
     """Features (E',) of one local goal (D,): those of its configuration, and where it lies.
 
-    The published models add the direction [rad]. A global CVAE has nothing to add to the place in
-    the map. The others move far goals to
+    The published models add the direction [rad]. Networks of whole maps have nothing to add to the
+    place in the map. The others move far goals to
     ``MAX_GOAL_DISTANCE``, and add the direction as a unit vector and the logarithm of the distance.
 
     Args:
@@ -68,7 +68,7 @@ def goal_features(
         q: (D,) goal in the local frame.
         points: (F, 3) its link frames [m].
     """
-    if config.kind == GLOBAL_CVAE:
+    if config.kind in MAP_KINDS:
         return configuration_features(config, robot, q, points)
     place = q[:2]
     if config.paper:

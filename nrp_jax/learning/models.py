@@ -11,8 +11,10 @@ import jax
 import jax.numpy as jnp
 
 GLOBAL_CVAE = "global-cvae"  # sees the whole map, and generates configurations along whole paths
+NEXT = "next"  # sees the whole map, and tells where to go from a configuration and how far it is
+MAP_KINDS = (GLOBAL_CVAE, NEXT)
 WAYPOINT_KINDS = ("discriminator", "cvae")
-KINDS = (*WAYPOINT_KINDS, GLOBAL_CVAE)
+KINDS = (*WAYPOINT_KINDS, *MAP_KINDS)
 FIRE = "fire"  # a database of experiences, see nrp_jax.learning.similarity
 TASKS = ("snake", "fetch")
 
@@ -22,7 +24,7 @@ class ModelConfig:
     """Architecture and inputs of a network; kept with its weights."""
 
     task: str  # "snake" or "fetch"
-    kind: str  # "discriminator", "cvae" or "global-cvae"
+    kind: str  # one of KINDS
     scope: str = "window"  # what the network sees: the local "window", or the whole "map"
     paper: bool = False  # the published architecture and its raw inputs
     patches: tuple[int, ...] = (4, 2)  # side of the patches each encoder layer merges
@@ -31,13 +33,20 @@ class ModelConfig:
     width: int = 64  # width of the layers after those, for each candidate or latent
     # Add to each candidate what the image holds where the robot would be; for windows only.
     lookup: bool = True
-    latent: int = 8  # dimensions of the CVAE's latent
+    latent: int = 8  # dimensions of the CVAE's latent; of NEXT, features of each of its channels
     kl_weight: float = 0.01  # of the CVAE's KL term
+    attention: int = 8  # channels that NEXT attends to
+    iterations: int = 20  # of the module with which NEXT plans on the map
 
     @classmethod
     def default(cls, task: str, kind: str, scope: str = "window") -> "ModelConfig":
         """The light architecture: patches merged by matrix products, heights as channels."""
         check_choices(task, kind, scope)
+        if kind == NEXT:
+            patches = (5, 2) if task == "snake" else (5, 3)
+            return cls(
+                task=task, kind=kind, scope="map", lookup=False, patches=patches, attention=4
+            )
         scope = "map" if kind == GLOBAL_CVAE else scope
         wide = {"channels": (64, 96), "context": 192} if task == "fetch" else {}
         if scope == "map":
@@ -54,6 +63,8 @@ class ModelConfig:
     def published(cls, task: str, kind: str, scope: str = "window") -> "ModelConfig":
         """The architecture of the paper, as its published code has it."""
         check_choices(task, kind, scope)
+        if kind == NEXT:
+            return cls(task=task, kind=kind, scope="map", paper=True, lookup=False)
         scope = "map" if kind == GLOBAL_CVAE else scope
         width = 512 if task == "snake" else 1024
         latent = 5 if task == "snake" else 8

@@ -86,13 +86,13 @@ def _states(world: GridWorld, q: np.ndarray, ends: np.ndarray, fraction: np.ndar
     for first in range(0, len(ends), POINT_BATCH):
         part = slice(first, first + POINT_BATCH)
         batch, at = (pad_rows(rows[part], POINT_BATCH) for rows in (ends, fraction))
-        states = _states_on(world, jnp.asarray(q[batch]), jnp.asarray(at, jnp.float32))
+        states = states_on(world, jnp.asarray(q[batch]), jnp.asarray(at, jnp.float32))
         made.append(np.asarray(states)[: len(ends[part])])
     return np.concatenate(made)
 
 
 @jax.jit
-def _states_on(world: GridWorld, ends: jax.Array, fraction: jax.Array) -> jax.Array:
+def states_on(world: GridWorld, ends: jax.Array, fraction: jax.Array) -> jax.Array:
     """States (n, D) at fractions (n,) of the edges between configurations (n, 2, D)."""
     edge = world.truncate(world.edge(ends[:, 0], ends[:, 1]), fraction)
     return world.normalize(world.end(ends[:, 0], edge))

@@ -6,6 +6,7 @@ from typing import Self
 import optax
 
 from nrp_jax.learning.models import GLOBAL_CVAE, check_choices
+from vrrt_jax.core.settings import setting
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,6 +44,38 @@ class TrainConfig:
             augment=False,
             plateau=10_000 if task == "fetch" else 5_000,
         )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OnlineConfig:
+    """How NEXT is trained; the defaults are those that the NRP paper's authors published."""
+
+    epochs: int = setting(50, 1, 100_000)  # on the expert's paths
+    batch: int = setting(256, 1, 65_536)  # states a step
+    learning_rate: float = setting(1e-3, 1e-8, 1.0)
+    weight_decay: float = setting(5e-5, 0.0, 1.0)  # in the gradient
+    value_weight: float = setting(0.1, 0.0, 1e3)  # of the values' squared error in the loss
+    augment: bool = False  # turn and mirror each path at random
+    problems: int = setting(9000, 0, 1_000_000)  # that its planner tries in the training homes
+    expansions: int = setting(500, 1, 1_000_000)  # of a problem
+    states: int = setting(2000, 1, 1_000_000)  # new ones after which it is trained again
+    round_epochs: int = setting(10, 1, 100_000)  # of each such training, on all paths so far
+    explored: float = setting(1.0, 0.0, 1.0)  # share of RRT*'s expansions in the first problems
+    least_explored: float = setting(0.1, 0.0, 1.0)  # and in the last ones, by tenths
+    lanes: int = setting(32, 1, 4096)  # expansions at a time
+    validation: float = 0.15  # share of the homes that is held out
+    minutes: float = setting(1e6, 0.0, endless=True)  # no epoch but the first begins after so many
+    seed: int = setting(0, 0, 2**31)
+
+    @classmethod
+    def light(cls) -> Self:
+        """For two cores: a tenth of the problems, fewer epochs, shorter rounds, and symmetries."""
+        return cls(epochs=8, problems=900, states=1000, round_epochs=1, augment=True, minutes=60.0)
+
+    def explored_in(self, problem: int) -> float:
+        """The share of RRT*'s expansions in a problem."""
+        tenths = int(10 * (self.explored - self.least_explored) * problem / max(self.problems, 1))
+        return max(self.explored - tenths / 10, self.least_explored)
 
 
 def check_settings(settings: TrainConfig) -> None:

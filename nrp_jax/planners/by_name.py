@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax.config import EDGE_STEPS, PlannerConfig
-from nrp_jax.learning.models import FIRE, GLOBAL_CVAE
+from nrp_jax.learning.models import FIRE, GLOBAL_CVAE, NEXT
 from nrp_jax.planners.cvae import CVAERRT, CVAEInformedRRTStar
+from nrp_jax.planners.next_planner import NEXTPlanner
 from nrp_jax.planners.nrp import NeuralRRT
 from nrp_jax.planners.nrp_connect import NRPConnect, packaged_sampler
 from nrp_jax.planners.nrp_star import NeuralRRTStar
@@ -23,7 +24,7 @@ DECOMPOSED = "decomposed"
 # Those of the last two rows go on to improve their paths until the budget ends.
 PLANNERS = (
     *("rrt", "rrt-is", "rrt-connect", "cvae-rrt", "fire", "nrp-d", "nrp-g", "nrp-connect"),
-    *("rrt-star", "irrt-star", "bit-star", "cvae-irrt-star"),
+    *("rrt-star", "irrt-star", "bit-star", "cvae-irrt-star", "next"),
     *("nrp-star-d", "nrp-star-g", "nrp-star-connect", "fire-star", DECOMPOSED),
 )
 FETCH_ONLY = ("fire", "fire-star", DECOMPOSED)  # the paper has them for the Fetch alone
@@ -31,6 +32,7 @@ FETCH_ONLY = ("fire", "fire-star", DECOMPOSED)  # the paper has them for the Fet
 KINDS = {
     "cvae-rrt": GLOBAL_CVAE,
     "cvae-irrt-star": GLOBAL_CVAE,
+    "next": NEXT,
     "fire": FIRE,
     "fire-star": FIRE,
     "nrp-d": "discriminator",
@@ -47,6 +49,7 @@ REWIRING = {
     "tries": 4,
     "ancestors": 4,
 }
+NEXT_REWIRING = {**REWIRING, "rewire_radius": np.float32(2.0)}  # as published
 
 
 def planners_of(task: str) -> tuple[str, ...]:
@@ -124,6 +127,9 @@ def policy_of(
         if planner in ("cvae-rrt", "fire"):
             return CVAERRT(**drawn)
         return CVAEInformedRRTStar(**drawn, **REWIRING)
+    if planner == "next":
+        guide = sampler.of_query(world, *ends)
+        return NEXTPlanner(goal_bias=bias, guide=guide, **shape, **NEXT_REWIRING)
     if planner in CONNECT:
         return NRPConnect(sampler=sampler, lanes=max(config.lanes, 2))
     rate = jnp.float32(config.straight_rate)
