@@ -74,27 +74,19 @@ class WorldSpheres:
         x, y, z = centers[:, :a, None] - centers[:, None, centers.shape[1] - b :]
         return x**2 + y**2 + z**2
 
-    def free_span(
-        self,
-        obstacles: Obstacles,
-        margin: jax.Array,
-        centers: tuple[jax.Array, jax.Array],
-        edge: jax.Array,
-    ) -> jax.Array:
+    def free_span(self, clearance: jax.Array, inner: jax.Array, edge: jax.Array) -> jax.Array:
         """How much of an edge is free for certain: distances divided by the spheres' speeds.
 
         Args:
-            obstacles: K slots.
-            margin: () asked of them [m].
-            centers: (3, n) of collision spheres and (3, m) of self-collision spheres.
+            clearance: (n,) of collision spheres to obstacles, see :meth:`clearances`.
+            inner: (3, m) centers of self-collision spheres.
             edge: (D,) the straight way that the joints go.
 
         Returns:
             () the share of the edge that is free before and after; negative if something touches.
         """
-        clearance = self.clearances(obstacles, centers[0], margin)
         # Pairs that are not checked are infinitely far apart.
-        apart = jnp.sqrt(self._squared_distances(centers[1]) + 1e-12)
+        apart = jnp.sqrt(self._squared_distances(inner) + 1e-12)
         gap = jnp.where(self.contact_distance > 0, apart - self.contact_distance, jnp.inf)
         speed, relative_speed = (
             jnp.tensordot(jnp.abs(edge), arms, 1) + 1e-9
@@ -121,17 +113,19 @@ class WorldSpheres:
         distance[:, distance.shape[1] - len(held) :] = held.T
         return dataclasses.replace(self, gripped_distance=jnp.asarray(distance))
 
-    def held_are_free(
+    def held_clearances(
         self, obstacles: Obstacles, margin: jax.Array, poses: jax.Array
-    ) -> jax.Array | bool:
-        """Whether all that the robot holds touches nothing, () bool, at link poses (L, 4, 4)."""
-        if self.num_held == (0, 0):
-            return True
-        first, second = (-count for count in self.num_held)
-        clearance = self.clearances(obstacles, place(self.collision, poses), margin)
-        gap = self.squared_gaps(place(self.self_collision, poses))
-        apart = jnp.min(gap[:, second:], initial=jnp.inf)
-        return (jnp.min(clearance[first:]) > 0) & (apart >= 0)
+    ) -> jax.Array:
+        """:meth:`clearances` (h,) of what the robot holds alone, at link poses (L, 4, 4)."""
+        first = len(self.radius) - self.num_held[0]
+        matrix = self.collision.reshape(-1, 3, len(self.radius))[:, :, first:]
+        centers = place(matrix.reshape(len(matrix), -1), poses)
+        distances = signed_distances(obstacles, centers)
+        return jnp.min(distances - self._needed(margin)[:, first:], axis=0)
+
+    def held_are_apart(self, inner: jax.Array) -> jax.Array:
+        """Whether what is held touches no link, () bool; self-collision spheres at (3, m)."""
+        return jnp.all(self.squared_gaps(inner)[:, -self.num_held[1] :] >= 0)
 
 
 def world_spheres(
