@@ -67,7 +67,7 @@ class ClosedFormWorld(World):
             return {}
         return {"spheres": self.spheres.among(self.attached, [o.name for o in obstacles])}
 
-    def with_margin(self, margin: float) -> Self:
+    def with_margin(self, margin: float | jax.Array) -> Self:
         """See :func:`vrrt_jax.scene.world.with_margin`."""
         spheres = self.spheres.farther_apart(margin)
         return dataclasses.replace(self, margin=self.margin + margin, spheres=spheres)

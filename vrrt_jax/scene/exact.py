@@ -302,7 +302,7 @@ def _build(
     add_slots(spec, room, bits=ALL_BITS if has_meshes else 1)
     spec.memory = 1 << 23  # room for the contacts of a robot deep inside an obstacle
     model = spec.compile()
-    # Contacts are reported from afar; MuJoCo adds up the margins of two geoms. Trees of boxes inside
+    # Contacts are reported from afar; MuJoCo adds up the margins of a pair. Trees of boxes inside
     # bodies are of no use to slots.
     model.geom_margin[:] = NEAR / 2
     model.pair_margin[:] = NEAR

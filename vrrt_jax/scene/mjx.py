@@ -26,13 +26,12 @@ from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import TraceIgnoredNames, pytree, static
 from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.kinematics import link_poses, place
-from vrrt_jax.robots.self_collision import checked_pairs
 from vrrt_jax.scene.batch_last import Value, evaluate
 from vrrt_jax.scene.flat_program import FlatProgram, flat_program
 from vrrt_jax.scene.held import HeldObject
 from vrrt_jax.scene.obstacle_kinds import KINDS
 from vrrt_jax.scene.obstacles import PARKED, Obstacle, Obstacles, signed_distances, to_slots
-from vrrt_jax.scene.spheres import WorldSpheres, world_spheres
+from vrrt_jax.scene.spheres import WorldSpheres, least, world_spheres
 from vrrt_jax.scene.world import World
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used, is absent
@@ -121,7 +120,7 @@ class MjxWorld(World):
             spheres=spheres.farther_apart(float(self.spheres.self_margin)),
         )
 
-    def with_margin(self, margin: float) -> Self:
+    def with_margin(self, margin: float | jax.Array) -> Self:
         """See :func:`vrrt_jax.scene.world.with_margin`."""
         return dataclasses.replace(
             self,
@@ -209,7 +208,7 @@ class MjxScene:
             [data.xmat[self.link_bodies], data.xpos[self.link_bodies, :, None]], axis=2
         )
         poses = jnp.concatenate([jnp.eye(4)[None, :3], poses])
-        return free, jnp.min(distances, axis=0, initial=jnp.inf), poses
+        return free, least(distances), poses
 
     @functools.cached_property
     def program(self) -> FlatProgram:
