@@ -107,7 +107,8 @@ def _attempt(
             compile_s=found.compile_s + again.compile_s,
             search_s=found.search_s + again.search_s,
         )
-    result = finish(robot, world, found, chosen, q_start, key, config)
+    room = wary if is_there else None
+    result = finish(robot, world, found, chosen, q_start, key, config, room)
     status = result.status
     if path is None:
         status = STATUS_OF.get(found.stopped, Status.NO_PATH)

@@ -65,6 +65,7 @@ def finish(
     q_start: np.ndarray,
     key: jax.Array,
     config: PlannerConfig,
+    room: World | None = None,
 ) -> PlanResult:
     """Shorten and verify the chosen path, and say what became of the plan.
 
@@ -78,10 +79,12 @@ def finish(
         q_start: (D,).
         key: random key of shortcutting.
         config: settings.
+        room: the world with the clearance that the chosen path keeps; found here if it is None.
     """
     done = unchecked(q_start[None])
     if chosen.path is not None:
-        room = keeping_clearance(world, padded(chosen.path), config.path.margin)
+        if room is None:
+            room = keeping_clearance(world, padded(chosen.path), config.path.margin)
         done = postprocess(
             room,
             chosen.path,

@@ -138,7 +138,8 @@ def shapes_overlap(robot: MobileRobot, poses: np.ndarray) -> bool:
     if shapes is None:
         return False
     num, radius = len(shapes.link), np.asarray(shapes.radius)
-    ends = (poses[:, :3].reshape(-1) @ np.asarray(shapes.ends, float)).reshape(3, -1).T
+    rows = np.moveaxis(poses[:, :3], 1, 0).reshape(3, -1)
+    ends = (rows @ np.asarray(shapes.ends, float)).T
     start, axis = ends[:num], ends[num:] - ends[:num]
 
     def to_segment(point: np.ndarray, capsule: np.ndarray) -> np.ndarray:

@@ -51,7 +51,7 @@ class ExactScene:
                 type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1], contype=_FLOOR_BIT, conaffinity=0
             )
         for geom in spec.geoms:
-            geom.margin = NEAR  # contacts are reported from afar
+            geom.margin = NEAR / 2  # contacts are reported from afar; those of a pair add up
         self.model = spec.compile()
         self.lever_arms = lever_arms(self.model)  # (D, nbody, nbody)
         self._own = threading.local()

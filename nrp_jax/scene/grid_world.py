@@ -43,7 +43,7 @@ class GridWorld(PytreeSubclasses, StraightLineEdges):
     """
 
     chain: Chain
-    collision_spheres: jax.Array  # (L * 12, 3 n) their placement, see ``kinematics.placement``
+    collision_spheres: jax.Array  # (L * 4, n) their placement, see ``kinematics.placement``
     collision_radius: jax.Array  # (n,) [m]
     floor: jax.Array  # (n,) lowest height of their centers, -inf if they may touch the floor [m]
     planar_boxes: PlanarBoxes | None  # flat links checked against each other

@@ -22,7 +22,7 @@ class LinkShapes:
     Letters: ``M`` capsules, ``N`` boxes.
     """
 
-    ends: jax.Array  # (L * 12, 3 * 2 M) placement of the axes' ends, all first ones before
+    ends: jax.Array  # (L * 4, 2 M) placement of the axes' ends, all first ones before
     radius: jax.Array  # (M,) [m]
     box_center: jax.Array  # (N, 3) in the links' frames [m]
     box_rotation: jax.Array  # (N, 3, 3) to the links' frames

@@ -216,7 +216,7 @@ def search(
     history = [_record(policy, goal, states, 0.0)]
 
     def step(state: SearchState, key: jax.Array) -> tuple[SearchState, jax.Array]:
-        return jax.block_until_ready(advance(state, termination, key, jnp.int32(CHUNK)))
+        return jax.block_until_ready(advance(state, termination, key, np.int32(CHUNK)))
 
     started = time.perf_counter()
     with interruptible() as interrupted, ThreadPoolExecutor(copies) as pool:
@@ -278,7 +278,7 @@ def _compile(
 ) -> float:
     """Compile the loop, if it has not been; seconds."""
     started = time.perf_counter()
-    jax.block_until_ready(advance(state, termination, key, jnp.int32(0)))
+    jax.block_until_ready(advance(state, termination, key, np.int32(0)))
     return time.perf_counter() - started
 
 

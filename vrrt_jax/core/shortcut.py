@@ -53,7 +53,7 @@ def shortcut(
     path = np.asarray(path, np.float32)
     if len(path) < 3:
         return path
-    done = _shortcut(world, padded(path), jnp.int32(len(path)), key, rounds, patience)
+    done = _shortcut(world, padded(path), np.int32(len(path)), key, rounds, patience)
     return np.asarray(done.q)[: int(done.size)]
 
 

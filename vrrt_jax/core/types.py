@@ -5,6 +5,8 @@ Letters: ``B`` lanes (32), ``N`` node capacity, ``D`` joints. Joints in [rad] or
 
 import dataclasses
 import enum
+import operator
+from collections.abc import Callable
 from typing import Any, Generic, Protocol, TypeVar, dataclass_transform
 
 import jax
@@ -42,9 +44,17 @@ def _register(cls: type) -> None:
     leaves = [field.name for field in fields if not field.metadata.get("static")]
     statics = [field.name for field in fields if field.metadata.get("static")]
 
+    # JAX flattens arguments at every call, so that this has to be quick. Of two names or more
+    # ``attrgetter`` gives a tuple.
+    def tuple_of(names: list[str]) -> Callable[[Any], tuple]:
+        if len(names) > 1:
+            return operator.attrgetter(*names)
+        return lambda thing: tuple(getattr(thing, name) for name in names)
+
+    values_of, statics_of = tuple_of(leaves), tuple_of(statics)
+
     def flatten(thing: Any) -> tuple[tuple, tuple]:
-        values = tuple(getattr(thing, name) for name in leaves)
-        return values, tuple(getattr(thing, name) for name in statics)
+        return values_of(thing), statics_of(thing)
 
     def flatten_with_keys(thing: Any) -> tuple[tuple, tuple]:
         values, aux = flatten(thing)

@@ -95,7 +95,7 @@ def _product(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def placement(link: np.ndarray, points: np.ndarray, num_links: int) -> np.ndarray:
-    """The matrix (L * 12, 3 * n) with which :func:`place` takes poses to points on links.
+    """The matrix (L * 4, n) with which :func:`place` takes poses to points on links.
 
     One product of matrices places a whole batch; gathering a pose for every point costs XLA's CPU
     backend five times as much.
@@ -106,16 +106,15 @@ def placement(link: np.ndarray, points: np.ndarray, num_links: int) -> np.ndarra
         num_links: L.
     """
     n = len(link)
-    matrix = np.zeros((num_links, 3, 4, 3, n), np.float32)
-    for axis in range(3):
-        matrix[link, axis, :3, axis, np.arange(n)] = points
-        matrix[link, axis, 3, axis, np.arange(n)] = 1.0
-    return matrix.reshape(num_links * 12, 3 * n)
+    matrix = np.zeros((num_links, 4, n), np.float32)
+    matrix[link, :3, np.arange(n)] = points
+    matrix[link, 3, np.arange(n)] = 1.0
+    return matrix.reshape(num_links * 4, n)
 
 
 def place(matrix: jax.Array, poses: jax.Array) -> jax.Array:
     """World positions (3, n) of points on links posed by (L, 4, 4); see :func:`placement`."""
-    return (poses[:, :3].reshape(-1) @ matrix).reshape(3, -1)
+    return jnp.moveaxis(poses[:, :3], 1, 0).reshape(3, -1) @ matrix
 
 
 def lever_arms(

@@ -16,7 +16,7 @@ def near_pairs(model: mujoco.MjModel, data: mujoco.MjData, q: np.ndarray) -> Nea
     """Distances and bodies of the pairs that are nearer than the margins of their geoms.
 
     Args:
-        model: whose geoms have the margin :data:`NEAR`.
+        model: whose geoms have the margin ``NEAR / 2``; MuJoCo adds up the two of a pair.
         data: to compute in.
         q: (D,); negative distances are penetrations.
     """
@@ -64,7 +64,10 @@ def first_touch(
     while at < end:
         distance, bodies = near_at(q_from + at * turn)
         checked += 1
-        if distance.min(initial=0.0) < -tolerance:
+        if len(distance) == 0:
+            at += far
+            continue
+        if distance.min() < -tolerance:
             return at, checked
         own = speeds[bodies[:, 0], bodies[:, 1]]
         span = float((distance / own).min(initial=far))

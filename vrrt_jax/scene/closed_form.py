@@ -41,10 +41,11 @@ class ClosedFormWorld(World):
             return super().free_span(q, edge)
         poses, spheres = link_poses(self.chain, q), self.spheres
         # Behind a barrier the centers are computed once, and not again for every obstacle.
-        centers = jax.lax.optimization_barrier(
+        outer, inner = jax.lax.optimization_barrier(
             (place(spheres.collision, poses), place(spheres.self_collision, poses))
         )
-        return spheres.free_span(self.obstacles, self.margin, centers, edge)
+        clearance = spheres.clearances(self.obstacles, outer, self.margin)
+        return spheres.free_span(clearance, inner, edge)
 
     @single_precision
     def obstacle_clearance(self, q: jax.Array) -> jax.Array:
@@ -66,7 +67,7 @@ class ClosedFormWorld(World):
             return {}
         return {"spheres": self.spheres.among(self.attached, [o.name for o in obstacles])}
 
-    def with_margin(self, margin: float) -> Self:
+    def with_margin(self, margin: float | jax.Array) -> Self:
         """See :func:`vrrt_jax.scene.world.with_margin`."""
         spheres = self.spheres.farther_apart(margin)
         return dataclasses.replace(self, margin=self.margin + margin, spheres=spheres)

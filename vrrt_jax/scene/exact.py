@@ -302,8 +302,9 @@ def _build(
     add_slots(spec, room, bits=ALL_BITS if has_meshes else 1)
     spec.memory = 1 << 23  # room for the contacts of a robot deep inside an obstacle
     model = spec.compile()
-    # Contacts are reported from afar. Trees of boxes inside bodies are of no use to slots.
-    model.geom_margin[:] = NEAR
+    # Contacts are reported from afar; MuJoCo adds up the margins of a pair. Trees of boxes inside
+    # bodies are of no use to slots.
+    model.geom_margin[:] = NEAR / 2
     model.pair_margin[:] = NEAR
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
     # Which geoms are measured against obstacles for the clearance.

@@ -3,6 +3,10 @@
 MJX's pairs of geoms are fixed when a model is compiled. So a model has room for some obstacles of
 each type; those not in use are parked far away, and a type that a scene lacks costs nothing.
 Only signs of MJX's distances are used: for boxes it gives no more than that.
+
+What comes first, a broad phase, is what makes it fast: an obstacle is first touched by the sphere
+that is nearest to it, so that MJX judges one pair for each obstacle, not one for each sphere. MJX's
+own broad phase (``max_geom_pairs``) compares spheres around both, which says little of a wide box.
 """
 
 import contextlib
@@ -22,13 +26,12 @@ from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import TraceIgnoredNames, pytree, static
 from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.kinematics import link_poses, place
-from vrrt_jax.robots.self_collision import checked_pairs
 from vrrt_jax.scene.batch_last import Value, evaluate
 from vrrt_jax.scene.flat_program import FlatProgram, flat_program
 from vrrt_jax.scene.held import HeldObject
 from vrrt_jax.scene.obstacle_kinds import KINDS
 from vrrt_jax.scene.obstacles import PARKED, Obstacle, Obstacles, signed_distances, to_slots
-from vrrt_jax.scene.spheres import WorldSpheres, world_spheres
+from vrrt_jax.scene.spheres import WorldSpheres, least, world_spheres
 from vrrt_jax.scene.world import World
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used, is absent
@@ -51,7 +54,7 @@ class MjxObstacles:
     position: jax.Array  # (G, 3) [m]
     quaternion: jax.Array  # (G, 4) wxyz
     size: jax.Array  # (G, 3) as MuJoCo's geom size [m]
-    measured: Obstacles  # slots of those that MJX has no pair for
+    slots: Obstacles  # of these, and of those that MJX has no pair for
 
 
 @pytree
@@ -71,7 +74,7 @@ class MjxWorld(World):
     @single_precision
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.is_free`."""
-        return self._answer(q)[0] & self._held_are_free(q)
+        return self._answer(q)[0]
 
     def free_span(self, q: jax.Array, edge: jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`.
@@ -81,14 +84,8 @@ class MjxWorld(World):
         """
         if overrides_is_free(self):
             return super().free_span(q, edge)
-        is_free, first, second = self._answer(q)
-        is_free &= self._held_are_free(q)
-        if self.spheres.num_held[0]:
-            poses = link_poses(self.chain, q)
-            first, second = (
-                place(s, poses) for s in (self.spheres.collision, self.spheres.self_collision)
-            )
-        span = self.spheres.free_span(self.obstacles, self.margin, (first, second), edge)
+        is_free, clearance, inner = self._answer(q)
+        span = self.spheres.free_span(clearance, inner, edge)
         return jnp.where(is_free, jnp.maximum(span, 0.0), -1.0)
 
     @single_precision
@@ -96,16 +93,23 @@ class MjxWorld(World):
         """See :func:`vrrt_jax.scene.world.obstacle_clearance`; in closed form, as MJX has none."""
         return self.spheres.smallest_clearance(self.obstacles, link_poses(self.chain, q))
 
-    def _held_are_free(self, q: jax.Array) -> jax.Array | bool:
-        """Whether what the robot holds touches nothing, () bool."""
-        poses = link_poses(self.chain, q)
-        return self.spheres.held_are_free(self.obstacles, self.margin, poses)
+    def _answer(self, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Whether ``q`` (D,) is free, () bool, and what tells how far.
 
-    def _answer(self, q: jax.Array) -> tuple[jax.Array, ...]:
-        """Of :meth:`MjxScene.answer`."""
+        Returns:
+            () bool; distances (n,) of collision spheres to obstacles, less the margin [m]; centers
+            (3, m) of self-collision spheres [m].
+        """
         inputs = jax.lax.stop_gradient((self.geoms, self.margin, self.spheres.self_margin, q))
         *others, q = inputs
-        return tuple(part[0] for part in self.scene.answers(others, q[None]))
+        is_free, clearance, poses = (part[0] for part in self.scene.answers(others, q[None]))
+        # Behind a barrier the centers are computed once, and not again for every pair.
+        inner = jax.lax.optimization_barrier(place(self.spheres.self_collision, poses))
+        if self.spheres.num_held[0]:
+            held = self.spheres.held_clearances(self.obstacles, self.margin, poses)
+            is_free &= jnp.all(held > 0) & self.spheres.held_are_apart(inner)
+            clearance = jnp.append(clearance, held)
+        return is_free, clearance, inner
 
     def holding(self, attached: Sequence[HeldObject]) -> Self:
         """See :meth:`vrrt_jax.scene.world.World.holding`."""
@@ -116,7 +120,7 @@ class MjxWorld(World):
             spheres=spheres.farther_apart(float(self.spheres.self_margin)),
         )
 
-    def with_margin(self, margin: float) -> Self:
+    def with_margin(self, margin: float | jax.Array) -> Self:
         """See :func:`vrrt_jax.scene.world.with_margin`."""
         return dataclasses.replace(
             self,
@@ -160,41 +164,51 @@ class MjxScene:
 
     xml: str  # the robot
     room: tuple[int, ...]  # for obstacles of each type of ``_PAIRED``, and for all others
-    model: mjx.Model
+    model: mjx.Model  # its last geoms are G probes, and the G obstacles that each is paired with
     data: mjx.Data
     is_collision_sphere: np.ndarray  # (g,) bool
     is_self_collision_sphere: np.ndarray  # (g,) bool
-    contypes: tuple[np.ndarray, ...]  # (g,) each; under each, MJX checks pairs of one type alone
+    link_bodies: np.ndarray  # (L - 1,) int body of each moving link
 
     def answer(
         self, geoms: MjxObstacles, margin: jax.Array, self_margin: jax.Array, q: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Whether one configuration (D,) is free, and where the spheres are.
+        """Whether one configuration (D,) is free, how near obstacles are, and where links are.
 
         Returns:
-            () bool; centers (3, n) of collision spheres and (3, m) of self-collision spheres [m].
+            () bool; distances (n,) of collision spheres to obstacles, less the margin [m]; poses
+            (L, 4, 4) of links.
         """
         # Pairs touch where they come nearer than the margin: spheres are inflated by it, and those
         # that meet each other by half of it each.
         radii = self.model.geom_size[:, 0]
         radii += margin * self.is_collision_sphere + self_margin / 2 * self.is_self_collision_sphere
-        first = len(radii) - len(geoms.size)
+        paired = len(geoms.size)
+        first = len(radii) - paired
         model = self.model.replace(
             geom_size=self.model.geom_size.at[:, 0].set(radii).at[first:].set(geoms.size),
             geom_pos=self.model.geom_pos.at[first:].set(geoms.position),
             geom_quat=self.model.geom_quat.at[first:].set(geoms.quaternion),
         )
         data = mjx.kinematics(model, self.data.replace(qpos=q))
-        free = jnp.bool_(True)
-        for contype in self.contypes:
-            contact = mjx.collision(model.replace(geom_contype=contype), data)._impl.contact  # type: ignore
-            free &= jnp.all(contact.dist > 0)
         spheres = np.flatnonzero(self.is_collision_sphere)
         centers = data.geom_xpos[spheres].T
-        if self.room[-1]:
-            distances = signed_distances(geoms.measured, centers)
-            free &= jnp.all(distances > radii[spheres])
-        return free, centers, data.geom_xpos[np.flatnonzero(self.is_self_collision_sphere)].T
+        distances = signed_distances(geoms.slots, centers) - radii[spheres]
+        free = jnp.all(distances[paired:] > 0)
+        if self.model.npair:
+            # Each probe stands in for the sphere that is nearest to its obstacle.
+            nearest = jnp.argmin(distances[:paired], axis=1)
+            probes = slice(first - paired, first)
+            model = model.replace(
+                geom_size=model.geom_size.at[probes, 0].set(radii[spheres][nearest])
+            )
+            data = data.replace(geom_xpos=data.geom_xpos.at[probes].set(centers[:, nearest].T))
+        free &= jnp.all(mjx.collision(model, data)._impl.contact.dist > 0)  # type: ignore
+        poses = jnp.concatenate(
+            [data.xmat[self.link_bodies], data.xpos[self.link_bodies, :, None]], axis=2
+        )
+        poses = jnp.concatenate([jnp.eye(4)[None, :3], poses])
+        return free, least(distances), poses
 
     @functools.cached_property
     def program(self) -> FlatProgram:
@@ -276,26 +290,24 @@ def mjx_scene(xml: str, room: tuple[int, ...]) -> MjxScene:
         room: for obstacles of each type of ``_PAIRED``, and for all others.
     """
     spec = mujoco.MjSpec.from_string(xml)
-    # A body of their own: what the robot's file excludes from contact with the world's body, its
-    # base, says nothing of obstacles.
-    body = spec.worldbody.add_body()
-    for geom, count in zip(_PAIRED, room, strict=False):
-        for _ in range(count):
-            body.add_geom(type=geom, size=(1.0, 1.0, 1.0), contype=1, conaffinity=0)
+    types = [geom for geom, count in zip(_PAIRED, room, strict=False) for _ in range(count)]
+    has_spheres = any(g.group == int(mjcf_writer.COLLISION_GEOM["group"]) for g in spec.geoms)
+    # Bodies of their own: what the robot's file excludes from contact with the world's body, its
+    # base, says nothing of obstacles. Nothing but the pairs is checked between these geoms.
+    probes, obstacles = spec.worldbody.add_body(), spec.worldbody.add_body()
+    for k, geom in enumerate(types):
+        probes.add_geom(name=f"probe_{k}", size=(1.0, 0.0, 0.0), contype=0, conaffinity=0)
+        obstacles.add_geom(
+            name=f"obstacle_{k}", type=geom, size=(1.0, 1.0, 1.0), contype=0, conaffinity=0
+        )
+        if has_spheres:
+            spec.add_pair(geomname1=f"probe_{k}", geomname2=f"obstacle_{k}")
     model = spec.compile()
-    robot_geoms = np.arange(model.ngeom) < model.ngeom - sum(room[:-1])
-    is_of_robot = {
-        kind["group"]: robot_geoms & (model.geom_group == int(kind["group"]))
+    of_robot = np.arange(model.ngeom) < model.ngeom - 2 * len(types)
+    is_collision_sphere, is_self_collision_sphere = (
+        of_robot & (model.geom_group == int(kind["group"]))
         for kind in (mjcf_writer.COLLISION_GEOM, mjcf_writer.SELF_COLLISION_GEOM)
-    }
-    is_collision_sphere, is_self_collision_sphere = is_of_robot.values()
-    contypes = [
-        np.where(~robot_geoms & (model.geom_type == geom), 1, 0).astype(np.int32)
-        for geom, count in zip(_PAIRED, room, strict=False)
-        if count and is_collision_sphere.any()
-    ]
-    if len(checked_pairs(model, np.flatnonzero(is_self_collision_sphere))):
-        contypes.append(np.where(is_self_collision_sphere, model.geom_contype, 0).astype(np.int32))
+    )
     with jax.ensure_compile_time_eval():  # it may be asked for inside a user's jit
         on_device = mjx.put_model(model)
         return MjxScene(
@@ -305,7 +317,7 @@ def mjx_scene(xml: str, room: tuple[int, ...]) -> MjxScene:
             data=mjx.make_data(on_device),
             is_collision_sphere=is_collision_sphere,
             is_self_collision_sphere=is_self_collision_sphere,
-            contypes=tuple(contypes),
+            link_bodies=np.array(model.jnt_bodyid),
         )
 
 
@@ -325,9 +337,8 @@ def _room_for(obstacles: Sequence[Obstacle]) -> tuple[int, ...]:
 
 def _fill(obstacles: Sequence[Obstacle], room: tuple[int, ...]) -> MjxObstacles:
     """Obstacles in their places, and the rest parked."""
-    *paired, others = _by_type(obstacles)
     rows = []
-    for geom, group, count in zip(_PAIRED, paired, room, strict=False):
+    for geom, group, count in zip(_PAIRED, _by_type(obstacles), room, strict=False):
         for obstacle in group:
             size = KINDS[obstacle.kind].geom_size(obstacle.size)
             rows.append((*obstacle.position, *obstacle.quaternion, *size))
@@ -339,9 +350,10 @@ def _fill(obstacles: Sequence[Obstacle], room: tuple[int, ...]) -> MjxObstacles:
     position, quaternion, size = (
         jnp.asarray(part, jnp.float32) for part in np.split(table, (3, 7), axis=1)
     )
+    slots = [to_slots(group, count) for group, count in zip(_by_type(obstacles), room, strict=True)]
     return MjxObstacles(
         position=position,
         quaternion=quaternion,
         size=size,
-        measured=to_slots(others, room[-1]),
+        slots=jax.tree.map(lambda *parts: jnp.concatenate(parts), *slots),
     )

@@ -23,11 +23,11 @@ class WorldSpheres:
     Letters: ``n`` collision spheres, ``m`` self-collision spheres.
     """
 
-    collision: jax.Array  # (L * 12, 3 n) their placement, see ``kinematics.placement``
+    collision: jax.Array  # (L * 4, n) their placement, see ``kinematics.placement``
     radius: jax.Array  # (n,) of these [m]
     # Spheres of a held object may always be as near to obstacles as where it was gripped.
     gripped_distance: jax.Array  # (K, n) of their centers there, infinite for all others [m]
-    self_collision: jax.Array  # (L * 12, 3 m) placement of the others
+    self_collision: jax.Array  # (L * 4, m) placement of the others
     # Of the first a and the last b of them, which contain all pairs to check.
     contact_distance: jax.Array  # (a, b) at which two of them touch, 0 for unchecked pairs [m]
     # How far a collision sphere moves, and how much the distance of two self-collision spheres
@@ -41,7 +41,7 @@ class WorldSpheres:
         self, obstacles: Obstacles, centers: jax.Array, margin: jax.Array | float = 0.0
     ) -> jax.Array:
         """Distances (n,) of collision spheres at (3, n), larger by a margin, to obstacles [m]."""
-        return jnp.min(signed_distances(obstacles, centers) - self._needed(margin), axis=0)
+        return least(signed_distances(obstacles, centers) - self._needed(margin))
 
     def _needed(self, margin: jax.Array | float) -> jax.Array:
         """At which distances (K, n) of their centers collision spheres touch obstacles [m]."""
@@ -50,15 +50,14 @@ class WorldSpheres:
     def are_free(self, obstacles: Obstacles, margin: jax.Array, poses: jax.Array) -> jax.Array:
         """Whether all spheres touch nothing, () bool, on links posed by (L, 4, 4).
 
-        XLA's CPU backend asks "all" in half of the time in which it looks for the smallest; behind
-        the barrier it places the spheres once, and not again for every obstacle.
+        Behind the barrier they are placed once, and not again for every obstacle.
         """
         outer, inner = jax.lax.optimization_barrier(
             (place(self.collision, poses), place(self.self_collision, poses))
         )
         # A robot of few links may have no pair to check: then nothing can touch.
-        apart = jnp.all(self.squared_gaps(inner) >= 0)
-        return jnp.all(signed_distances(obstacles, outer) > self._needed(margin)) & apart
+        apart = jnp.all(least(self.squared_gaps(inner)) >= 0)
+        return jnp.all(self.clearances(obstacles, outer, margin) > 0) & apart
 
     def smallest_clearance(self, obstacles: Obstacles, poses: jax.Array) -> jax.Array:
         """Of all collision spheres, () [m], on links posed by (L, 4, 4)."""
@@ -74,27 +73,19 @@ class WorldSpheres:
         x, y, z = centers[:, :a, None] - centers[:, None, centers.shape[1] - b :]
         return x**2 + y**2 + z**2
 
-    def free_span(
-        self,
-        obstacles: Obstacles,
-        margin: jax.Array,
-        centers: tuple[jax.Array, jax.Array],
-        edge: jax.Array,
-    ) -> jax.Array:
+    def free_span(self, clearance: jax.Array, inner: jax.Array, edge: jax.Array) -> jax.Array:
         """How much of an edge is free for certain: distances divided by the spheres' speeds.
 
         Args:
-            obstacles: K slots.
-            margin: () asked of them [m].
-            centers: (3, n) of collision spheres and (3, m) of self-collision spheres.
+            clearance: (n,) of collision spheres to obstacles, see :meth:`clearances`.
+            inner: (3, m) centers of self-collision spheres.
             edge: (D,) the straight way that the joints go.
 
         Returns:
             () the share of the edge that is free before and after; negative if something touches.
         """
-        clearance = self.clearances(obstacles, centers[0], margin)
         # Pairs that are not checked are infinitely far apart.
-        apart = jnp.sqrt(self._squared_distances(centers[1]) + 1e-12)
+        apart = jnp.sqrt(self._squared_distances(inner) + 1e-12)
         gap = jnp.where(self.contact_distance > 0, apart - self.contact_distance, jnp.inf)
         speed, relative_speed = (
             jnp.tensordot(jnp.abs(edge), arms, 1) + 1e-9
@@ -106,7 +97,7 @@ class WorldSpheres:
         is_free = (jnp.min(clearance) > 0) & (jnp.min(gap, initial=jnp.inf) >= 0)
         return jnp.where(is_free, _ROUNDING * span, -1.0)
 
-    def farther_apart(self, margin: float) -> "WorldSpheres":
+    def farther_apart(self, margin: float | jax.Array) -> "WorldSpheres":
         """The same spheres, which touch each other while ``margin`` [m] is still between them."""
         # A contact distance of zero marks a pair that is not checked, and must stay zero.
         wider = jnp.where(self.contact_distance > 0, self.contact_distance + margin, 0.0)
@@ -121,17 +112,33 @@ class WorldSpheres:
         distance[:, distance.shape[1] - len(held) :] = held.T
         return dataclasses.replace(self, gripped_distance=jnp.asarray(distance))
 
-    def held_are_free(
+    def held_clearances(
         self, obstacles: Obstacles, margin: jax.Array, poses: jax.Array
-    ) -> jax.Array | bool:
-        """Whether all that the robot holds touches nothing, () bool, at link poses (L, 4, 4)."""
-        if self.num_held == (0, 0):
-            return True
-        first, second = (-count for count in self.num_held)
-        clearance = self.clearances(obstacles, place(self.collision, poses), margin)
-        gap = self.squared_gaps(place(self.self_collision, poses))
-        apart = jnp.min(gap[:, second:], initial=jnp.inf)
-        return (jnp.min(clearance[first:]) > 0) & (apart >= 0)
+    ) -> jax.Array:
+        """:meth:`clearances` (h,) of what the robot holds alone, at link poses (L, 4, 4)."""
+        first = len(self.radius) - self.num_held[0]
+        centers = place(self.collision[:, first:], poses)
+        return least(signed_distances(obstacles, centers) - self._needed(margin)[:, first:])
+
+    def held_are_apart(self, inner: jax.Array) -> jax.Array:
+        """Whether what is held touches no link, () bool; self-collision spheres at (3, m)."""
+        return jnp.all(self.squared_gaps(inner)[:, -self.num_held[1] :] >= 0)
+
+
+def least(rows: jax.Array) -> jax.Array:
+    """The minimum of k rows (k, ...) in each column, inf of no rows; NaN where one is NaN.
+
+    Halving is elementwise, and vectorized. In reductions over an axis that is not the last one,
+    XLA's CPU backend computes each element by itself, with all that leads to it.
+    """
+    if len(rows) == 0:
+        return jnp.full(rows.shape[1:], jnp.inf, rows.dtype)
+    while len(rows) > 1:
+        half = len(rows) // 2
+        odd = rows[2 * half :]
+        rows = jnp.minimum(rows[:half], rows[half : 2 * half])
+        rows = jnp.minimum(rows, odd) if len(odd) else rows
+    return rows[0]
 
 
 def world_spheres(

@@ -81,7 +81,7 @@ class World(PytreeSubclasses, StraightLineEdges):
         """
         raise NotImplementedError(_NO_ENGINE)
 
-    def with_margin(self, margin: float) -> Self:
+    def with_margin(self, margin: float | jax.Array) -> Self:
         """See :func:`with_margin`."""
         return dataclasses.replace(self, margin=self.margin + margin)
 
@@ -260,11 +260,20 @@ def keeping_clearance(world: World, q: np.ndarray, margin: float) -> World:
     Returns:
         A world with the whole margin or a part of it; the world itself if none is left.
     """
+    q = np.asarray(q, np.float32)
     for share in _MARGIN_SHARES if margin > 0 else ():
-        wary = with_margin(world, share * margin)
-        if bool(jnp.all(batch_is_free(wary, jnp.asarray(q, jnp.float32)))):
-            return wary
+        leaves, are_free = _wary(world, np.float32(share * margin), q)
+        if are_free:
+            # What only the host knows, such as names, is that of this world.
+            return jax.tree.unflatten(jax.tree.structure(world), leaves)
     return world
+
+
+@jax.jit
+def _wary(world: World, margin: jax.Array, q: jax.Array) -> tuple[list[jax.Array], jax.Array]:
+    """The leaves of a world with a margin, and whether all of q (n, D) are free in it, () bool."""
+    wary = world.with_margin(margin)
+    return jax.tree.leaves(wary), jnp.all(jax.vmap(is_free, (None, 0))(wary, q))
 
 
 def checked_more_finely(world: World) -> World:

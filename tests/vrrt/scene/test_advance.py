@@ -1,5 +1,6 @@
 """The exact check misses nothing thin, however far the arm reaches, in any thread."""
 
+import copy
 import dataclasses
 import gc
 import threading
@@ -8,12 +9,13 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
+import mujoco
 import numpy as np
 import pytest
 
 import vrrt_jax
 from vrrt_jax.scene import exact
-from vrrt_jax.scene.advance import FINEST, first_touch
+from vrrt_jax.scene.advance import FINEST, NEAR, first_touch, near_pairs
 
 CASES = Path(__file__).parents[2] / "cases" / "arms"
 EGG = vrrt_jax.Obstacle(name="egg", kind="sphere", position=(0, 0, 0.1), size=(0.02, 0, 0))
@@ -71,6 +73,20 @@ def test_thin_rods_and_balls_in_the_way_of_the_panda_are_met(panda, rng):
             name="dot", kind="sphere", position=tuple(place), size=(2e-4, 0.0, 0.0)
         )
         assert not vrrt_jax.verify_path(panda, [dot], path, geometry="spheres").ok
+
+
+def test_all_pairs_nearer_than_the_margins_are_reported_and_no_others(panda, rng):
+    world = vrrt_jax.load_problem("panda_posts", engine="closed_form").world
+    scene = exact.exact_scene(panda, world, geometry="spheres")
+    wider = copy.copy(scene.model)
+    wider.geom_margin[:] = NEAR
+    data, count = mujoco.MjData(wider), 0
+    for q in rng.uniform(panda.lower, panda.upper, (100, panda.num_joints)):
+        found, (all_found, _) = np.sort(scene.near(q)[0]), near_pairs(wider, data, q)
+        assert found.max(initial=0.0) <= NEAR
+        np.testing.assert_allclose(found, np.sort(all_found[all_found <= NEAR]), atol=1e-9)
+        count += len(found)
+    assert count > 100
 
 
 def test_steps_follow_distances():

@@ -12,7 +12,15 @@ from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import batch_link_poses, link_poses
 from vrrt_jax.scene.closed_form import ClosedFormWorld
 from vrrt_jax.scene.obstacles import load_obstacles, signed_distances
-from vrrt_jax.scene.world import World, batch_clearance, batch_is_free, pose_error, with_margin
+from vrrt_jax.scene.spheres import least
+from vrrt_jax.scene.world import (
+    World,
+    batch_clearance,
+    batch_is_free,
+    keeping_clearance,
+    pose_error,
+    with_margin,
+)
 
 DISTANCE_TOLERANCE = 2e-5  # [m]; worst seen 4e-6, near a plane drawn as a 100 m box
 
@@ -280,3 +288,22 @@ def test_the_smallest_clearance_is_that_of_the_first_ones(wall_world, rng):
     for num, last in ((1, 63), (64, 63), (100, 127), (150, 149)):
         assert float(batch_clearance(wall_world, q, num)) == pytest.approx(each[last], abs=1e-6)
     assert each[127] > each[149] + 1e-3
+
+
+@pytest.mark.parametrize("num", [0, 1, 2, 3, 7, 16, 44])
+def test_least_is_the_minimum_of_rows(num, rng):
+    rows = rng.normal(size=(num, 5)).astype(np.float32)
+    rows[num // 2 : num // 2 + 1, 3] = np.nan
+    np.testing.assert_array_equal(least(jnp.asarray(rows)), jnp.min(rows, axis=0, initial=jnp.inf))
+
+
+def test_a_world_that_keeps_a_clearance_has_its_own_names(panda):
+    """The program that finds it may have been compiled for a world of other names."""
+    ball = vrrt_jax.Obstacle(name="ball", kind="sphere", position=(2, 0, 0), size=(0.1, 0, 0))
+    for name in ("first", "second"):
+        world = vrrt_jax.build_world(
+            panda, [dataclasses.replace(ball, name=name)], engine="closed_form"
+        )
+        wary = keeping_clearance(world, panda.home[None], 0.01)
+        assert [o.name for o in vrrt_jax.obstacle_list(wary)] == [name]
+        assert float(wary.margin) == pytest.approx(0.01)
