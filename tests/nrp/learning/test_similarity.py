@@ -141,7 +141,7 @@ def test_far_goals_are_moved_nearer(fetch):
 
 def test_a_training_goes_on_and_its_database_is_read(fetch, dataset, entries, tmp_path, capsys):
     shared = {
-        "settings": FireSettings(epochs=3, batch=8, pairs=80),
+        "settings": FireSettings(epochs=3, batch=8, pairs=400),
         "stamp": "x",
         "progress": False,
     }
