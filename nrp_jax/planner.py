@@ -1,6 +1,7 @@
 """Planning, from the outside: what users call, with every input checked on the host."""
 
 import dataclasses
+import functools
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -145,6 +146,7 @@ def plan(
                 policy,
                 tree,
                 places,
+                scene,
                 key=jax.random.fold_in(key, attempt),
                 termination=make_termination(policy.goal_score(goal), max_iterations=iterations),
                 time_limit_s=left_s,
@@ -180,15 +182,22 @@ def _searched(
     policy: Any,
     tree: Any,
     places: "_Places",
+    scene: ExactScene,
     **options: Any,
 ) -> tuple[SearchResult, np.ndarray | None]:
     """What a planner finds, and the path (P, D) if there is one."""
     if planner == DECOMPOSED:
         return search_decomposed(world, goal, policy, tree, grid=places.local_grid(), **options)
     if isinstance(policy, NRPConnect):
-        again = planner == "nrp-star-connect"
-        grow = search_with_restarts if again else search_by_drive
-        return grow(world, goal, policy, tree, folded=folded_postures(robot.name), **options)
+        options["folded"] = folded_postures(robot.name)
+        if planner != "nrp-star-connect":
+            return search_by_drive(world, goal, policy, tree, **options)
+
+        def accept(path: np.ndarray) -> bool:
+            verification = _checked(scene, world, places, path).verification
+            return verification is not None and verification.ok
+
+        return search_with_restarts(world, goal, policy, tree, accept=accept, **options)
     found = search(world, goal, policy, tree, **options)
     return found, policy.extract_path(found.tree)
 
@@ -255,6 +264,16 @@ def _config(config: PlannerConfig | None, settings: dict[str, Any]) -> PlannerCo
     return config
 
 
+def _checked(scene: ExactScene, world: GridWorld, places: _Places, path: np.ndarray) -> CheckedPath:
+    """What the exact check says of a path (P, D) of the planners' own world."""
+    trajectory, waypoints = with_waypoints(world, path)
+    # Waypoints in the turns that the robot is in by then, so that they can be interpolated.
+    path = nearest_turn(world, path, trajectory[waypoints])
+    lower, upper = (places.of(np.asarray(a)) for a in (world.lower, world.upper))
+    verification = verify(scene, places.of_path(trajectory), lower=lower, upper=upper)
+    return CheckedPath(path=path, trajectory=trajectory, verification=verification)
+
+
 def _finish(
     scene: ExactScene,
     world: GridWorld,
@@ -267,15 +286,7 @@ def _finish(
 ) -> PlanResult:
     """Shorten and verify what a search found, ``raw`` (P, D)."""
     loss, threshold = float(goal.loss(world, jnp.asarray(raw[-1]))), float(goal.threshold)
-
-    def check(path: np.ndarray) -> CheckedPath:
-        trajectory, waypoints = with_waypoints(world, path)
-        # Waypoints in the turns that the robot is in by then, so that they can be interpolated.
-        path = nearest_turn(world, path, trajectory[waypoints])
-        lower, upper = (places.of(np.asarray(a)) for a in (world.lower, world.upper))
-        verification = verify(scene, places.of_path(trajectory), lower=lower, upper=upper)
-        return CheckedPath(path=path, trajectory=trajectory, verification=verification)
-
+    check = functools.partial(_checked, scene, world, places)
     if loss <= threshold:
         finer = dataclasses.replace(world, resolution=world.resolution / 2)
         done = postprocess(finer, raw, check, key=key, shorten=shorten)

@@ -56,9 +56,22 @@ class Mixture:
 class ExperienceSampler:
     """A database of experiences, which makes a mixture for each query."""
 
-    def __init__(self, robot: MobileRobot, database: Database, sigma: float = SIGMA):
-        """Take a database of this robot."""
-        self.robot, self.database, self.sigma = robot, database, sigma
+    def __init__(
+        self,
+        robot: MobileRobot,
+        database: Database,
+        sigma: float = SIGMA,
+        distance: float = MARGIN,
+    ):
+        """Take a database of this robot.
+
+        Args:
+            robot: to plan for.
+            database: of this robot.
+            sigma: standard deviation around a sample [m] and [rad].
+            distance: of latents, within which an entry is taken.
+        """
+        self.robot, self.database, self.sigma, self.distance = robot, database, sigma, distance
         self.config = ModelConfig(task=database.task, kind=FIRE)
 
     @single_precision
@@ -83,7 +96,7 @@ class ExperienceSampler:
         latents = encode_parts(
             self.database.variables, jnp.asarray(cells[None]), home, corners, seen
         )
-        part, entry = _near(latents, self.database.latents)
+        part, entry = _near(latents, self.database.latents, self.distance)
         if len(part) > MOST:
             kept = np.random.default_rng(seed).choice(len(part), MOST, replace=False)
             part, entry = part[kept], entry[kept]
@@ -98,16 +111,18 @@ class ExperienceSampler:
         )
 
 
-def _near(latents: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (k,) and (k,) of latents and others that are nearer than the margin."""
-    # |a - b|^2 < m^2 is a b - |b|^2 / 2 > (|a|^2 - m^2) / 2.
+def _near(
+    latents: np.ndarray, others: np.ndarray, distance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (k,) and (k,) of latents and others that are nearer than a distance."""
+    # |a - b|^2 < d^2 is a b - |b|^2 / 2 > (|a|^2 - d^2) / 2.
     found: list[Any] = []
     halves = np.sum(others**2, axis=1) / 2
     for first in range(0, len(latents), 64):
         some = latents[first : first + 64]
         close = some @ others.T
         close -= halves
-        row, entry = np.nonzero(close > (np.sum(some**2, axis=1)[:, None] - MARGIN**2) / 2)
+        row, entry = np.nonzero(close > (np.sum(some**2, axis=1)[:, None] - distance**2) / 2)
         found.append((row + first, entry))
     part, entry = (np.concatenate(column) for column in zip(*found, strict=True))
     return part, entry

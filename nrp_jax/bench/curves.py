@@ -162,25 +162,30 @@ def add_arguments(subparsers: Any) -> None:
     )
     parser.add_argument("--poses", help="JSON or .npz of named configurations: all ordered pairs")
     parser.add_argument("--poses-key", help="the only name in that file to take")
-    number = {"--num-homes": 5, "--queries": 50, "--runs": 1, "--jobs": 1}
-    words = ("homes or maps at most", "of a home", "of each query", "processes")
-    for (name, default), text in zip(number.items(), words, strict=True):
-        parser.add_argument(name, type=command.whole(1, 100_000), default=default, help=text)
-    parser.add_argument(
-        "--budget", type=command.real(0.01, 1e6), default=10.0, help="of each search [s]"
-    )
-    parser.add_argument(
-        "--lanes", type=command.whole(1, 4096), default=32, help="expansions at a time"
-    )
+    count = command.whole(1, 100_000)
+    parser.add_argument("--num-homes", type=count, default=5, help="homes or maps at most")
+    parser.add_argument("--queries", type=count, default=50, help="of a home")
     parser.add_argument(
         "--nodes",
         type=command.whole(0, 1_000_000),
         default=5000,
         help="of the roadmaps that paths are compared with; 0 for none",
     )
+    add_measuring(parser, seed_help="of homes, queries and plans")
+
+
+def add_measuring(parser: argparse.ArgumentParser, seed_help: str) -> None:
+    """Add how often and how long plans are measured, and where rows go."""
+    count = command.whole(1, 100_000)
+    parser.add_argument("--runs", type=count, default=1, help="of each query")
+    parser.add_argument("--jobs", type=count, default=1, help="processes")
     parser.add_argument(
-        "--seed", type=command.whole(0, 100_000), default=0, help="of homes, queries and plans"
+        "--budget", type=command.real(0.01, 1e6), default=10.0, help="of each search [s]"
     )
+    parser.add_argument(
+        "--lanes", type=command.whole(1, 4096), default=32, help="expansions at a time"
+    )
+    parser.add_argument("--seed", type=command.whole(0, 100_000), default=0, help=seed_help)
     parser.add_argument("--json", help="write results here; go on from the rows beside it")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from nrp_jax.bench import curve_homes
 from nrp_jax.bench.curve_rows import Setting
-from nrp_jax.bench.curves import CurveBenchmark, measure
+from nrp_jax.bench.curves import CurveBenchmark, add_measuring, measure
 from nrp_jax.planners.by_name import DECOMPOSED, check_names
 from nrp_jax.scene.robots import load_robot
 from vrrt_jax.core import command
@@ -84,18 +84,7 @@ def add_arguments(subparsers: Any) -> None:
         default=",".join(DEFAULT),
         help="names for nrp_jax.plan; ratios are to the last one",
     )
-    number = {"--runs": 1, "--jobs": 1}
-    words = ("of each leg", "processes")
-    for (name, default), text in zip(number.items(), words, strict=True):
-        parser.add_argument(name, type=command.whole(1, 100_000), default=default, help=text)
-    parser.add_argument(
-        "--budget", type=command.real(0.01, 1e6), default=10.0, help="of each search [s]"
-    )
-    parser.add_argument(
-        "--lanes", type=command.whole(1, 4096), default=32, help="expansions at a time"
-    )
-    parser.add_argument("--seed", type=command.whole(0, 100_000), default=0, help="of the plans")
-    parser.add_argument("--json", help="write results here; go on from the rows beside it")
+    add_measuring(parser, seed_help="of the plans")
 
 
 def _run_command(arguments: argparse.Namespace) -> int:

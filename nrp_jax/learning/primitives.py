@@ -2,8 +2,8 @@
 
 FIRE (Chamzas et al. 2022) cuts a home into parts that overlap. An *entry* of its database is a
 part, the query's start and goal as seen from there, and a configuration that the query's path had
-there. Two entries are *alike* if each one's sample would do for the other. Letters: ``n`` entries,
-``m`` pairs, ``W`` parts of a home, ``D`` joints, ``E`` features.
+in its middle. Two entries are *alike* if each one's sample would do for the other. Letters: ``n``
+entries, ``m`` pairs, ``W`` parts of a home, ``D`` joints, ``E`` features.
 """
 
 import dataclasses
@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import cKDTree
 
 from nrp_jax.homes.grid import Grid
 from nrp_jax.learning.data import Dataset
@@ -22,10 +21,6 @@ from nrp_jax.scene.world import batch_is_free, build_world, with_grid
 from vrrt_jax.core.precision import single_precision
 
 SIDE, STRIDE = 20, 5  # cells of a part's sides, and between parts: 2 m and 0.5 m
-NEAR = 0.5  # samples that are alike are no farther apart than this, see :func:`_places` [m]
-NEIGHBORS = 64  # nearest samples among which one that may be alike is drawn
-_HEADING = 0.3  # meters that a heading's unit vector counts for
-_ARM = 0.125  # meters that a radian of the arm counts for, as in the paper's metric
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -94,7 +89,10 @@ def query_features(robot: MobileRobot, start: np.ndarray, goal: np.ndarray) -> n
 
 
 def make_entries(dataset: Dataset) -> Entries:
-    """The entries of all rows of a data set: one for each part that a sample's base is in.
+    """The entries of a data set's rows: the part whose middle is nearest to the sample's base.
+
+    A part that has the sample elsewhere does not tell where in it the sample would do. Samples that
+    no part has in its middle, beside the walls around a map, are left out.
 
     Args:
         dataset: of experiences.
@@ -103,8 +101,8 @@ def make_entries(dataset: Dataset) -> Entries:
     for home, grid in enumerate(dataset.grids):
         own = np.flatnonzero(rows["home"] == home)
         corners = corners_of_parts(cells_of_parts(grid.occupied).shape)
-        cell = np.floor(rows["waypoint"][own, :2] / grid.resolution)[:, None]
-        row, part = np.nonzero(((corners <= cell) & (cell < corners + SIDE)).all(axis=-1))
+        inside = (rows["waypoint"][own, :2] / grid.resolution)[:, None] - corners - SIDE / 2
+        row, part = np.nonzero(((-STRIDE / 2 <= inside) & (inside < STRIDE / 2)).all(axis=-1))
         middle = middles(corners[part], grid.resolution)
         shift = np.pad(middle, [(0, 0), (0, rows["waypoint"].shape[1] - 2)])
         columns = {
@@ -131,8 +129,8 @@ def make_pairs(
 ) -> Pairs:
     """Pairs of entries of different homes, half of them alike.
 
-    Two are alike if their samples are near each other, and each is free in the home of the other,
-    when it is placed in the other's part. Of those that are not, half are near but not free.
+    Two are alike if the sample of each is free in the home of the other, when it is placed in the
+    other's part.
 
     Args:
         robot: the robot.
@@ -142,41 +140,22 @@ def make_pairs(
         num: pairs, at most.
 
     Raises:
-        ValueError: the entries are of one home, or no two are alike.
+        ValueError: the entries are of one home, or all pairs are alike, or none.
     """
     if len(np.unique(entries.home)) < 2:
         raise ValueError("the experiences are of one home; expected two or more, to compare them")
-    places = _places(robot, entries.sample)
-    tree = cKDTree(places)
-    # Near ones: for entries that are drawn, one of the nearest that is of another home.
-    first = rng.integers(len(entries), size=2 * num)
-    apart, near = tree.query(places[first], min(NEIGHBORS, len(entries)))
-    usable = (entries.home[near] != entries.home[first][:, None]) & (apart <= NEAR)
-    chosen = np.argmax(usable * rng.random(usable.shape), axis=1)
-    some = usable.any(axis=1)
-    index = np.stack([first, near[np.arange(len(first)), chosen]], axis=1)[some]
+    index = rng.integers(len(entries), size=(2 * num, 2))
+    index = index[entries.home[index[:, 0]] != entries.home[index[:, 1]]]
     alike = _placed_free(robot, grids, entries, index)
-    alike &= _placed_free(robot, grids, entries, index[:, ::-1])
-    # Others at random, those that happen to be near left out.
-    random = rng.integers(len(entries), size=(2 * num, 2))
-    far = np.linalg.norm(places[random[:, 0]] - places[random[:, 1]], axis=1) > NEAR
-    random = random[far & (entries.home[random[:, 0]] != entries.home[random[:, 1]])]
-    good, bad = index[alike][: num // 2], index[~alike]
-    if not len(good):
-        raise ValueError("no two experiences of different homes are alike; expected more homes")
-    kinds = (good, bad[: len(good) // 2], random[: len(good) - min(len(bad), len(good) // 2)])
-    index = np.concatenate(kinds)
-    order = rng.permutation(len(index))
-    return Pairs(index=index[order], alike=(np.arange(len(index)) < len(kinds[0]))[order])
-
-
-def _places(robot: MobileRobot, sample: np.ndarray) -> np.ndarray:
-    """Samples (n, D) as places whose straight distance is nearly that of the metric [m]."""
-    heading, arm = sample[:, 2], sample[:, 3:]
-    turning = np.asarray(robot.is_continuous)[3:]
-    parts = [sample[:, :2], _HEADING * np.stack([np.cos(heading), np.sin(heading)], axis=1)]
-    parts += [_ARM * arm[:, ~turning], _ARM * np.cos(arm[:, turning])]
-    return np.concatenate([*parts, _ARM * np.sin(arm[:, turning])], axis=1)
+    alike[alike] = _placed_free(robot, grids, entries, index[alike, ::-1])
+    half = min(alike.sum(), (~alike).sum(), num // 2)
+    if not half:
+        raise ValueError(
+            f"of {len(alike)} pairs of experiences {alike.sum()} are alike; expected more homes"
+        )
+    kept = np.concatenate([np.flatnonzero(alike)[:half], np.flatnonzero(~alike)[:half]])
+    kept = rng.permutation(kept)
+    return Pairs(index=index[kept], alike=alike[kept])
 
 
 def _placed_free(

@@ -3,7 +3,6 @@
 import argparse
 import dataclasses
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,23 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from tqdm import tqdm
 
 from nrp_jax.learning import models, similarity
 from nrp_jax.learning.batches import Examples, empty_batch, load_examples, make_batch
 from nrp_jax.learning.checkpoint import Model, build_module, save_model
 from nrp_jax.learning.data import fingerprint, load_dataset
+from nrp_jax.learning.epochs import History, run_epochs
 from nrp_jax.learning.models import ModelConfig
 from nrp_jax.learning.objective import init, loss_fn, validate
 from nrp_jax.learning.recipe import TrainConfig, check_settings, make_optimizer
-from nrp_jax.learning.training_io import (
-    CheckpointStore,
-    State,
-    claim_output_dir,
-    epochs_since_best,
-    plot_curves,
-    write_log,
-)
+from nrp_jax.learning.training_io import State, claim_output_dir, plot_curves
 from nrp_jax.scene.robots import MobileRobot, load_robot
 from vrrt_jax.core import command
 from vrrt_jax.core.precision import single_precision
@@ -85,63 +77,30 @@ def train(
         optimizer=optimizer.init(variables["params"]),
         step=jnp.int32(0),
     )
-    store = CheckpointStore(out / "checkpoint")
-    state, best, history = store.restore(state)
     update = _make_update(config, robot, module, optimizer, settings)
 
-    def export() -> Model:
+    def export(best: Any, history: History) -> Model:
         figures = min(history, key=lambda row: row["loss"])
         info = {"num_outputs": sample.waypoints.shape[-1], "data": stamp, "best": figures}
         model = Model(config=config, variables=best, info=info)
         save_model(model, out / "model.npz")
         return model
 
-    # Epochs that are not done yet.
-    bar = tqdm(
-        range(len(history), settings.epochs),
-        initial=len(history),
-        total=settings.epochs,
-        desc=f"{config.task} {config.kind}",
-        unit="epoch",
-        disable=not progress,
+    best, history = run_epochs(
+        state,
+        out,
+        update=lambda state, chosen: update(state, examples, jnp.asarray(chosen)),
+        validate=lambda variables: validate(config, module, robot, variables, examples, validation),
+        training=training,
+        batch=size,
+        epochs=settings.epochs,
+        patience=settings.patience,
+        seed=settings.seed,
+        title=f"{config.task} {config.kind}",
+        progress=progress,
+        on_best=export,
     )
-    for epoch in bar:
-        if epochs_since_best(history) >= settings.patience:
-            break
-        # One epoch: all training queries in a random order that the seed and the epoch fix.
-        started = time.perf_counter()
-        order = np.random.default_rng([settings.seed, epoch]).permutation(training)
-        losses = []
-        for chosen in order[: len(order) // size * size].reshape(-1, size):
-            state, loss = update(state, examples, jnp.asarray(chosen))
-            losses.append(loss)
-        # The held-out homes decide whether this epoch is the best so far.
-        figures = validate(config, module, robot, state.variables, examples, validation)
-        if not np.isfinite(figures["loss"]):
-            store.close()
-            raise RuntimeError(
-                f"training diverged in epoch {epoch}: the best epoch before is kept in '{out}'; "
-                "lower --learning-rate and choose another folder with --out"
-            )
-        history.append(
-            {
-                "epoch": epoch,
-                "train_loss": float(np.mean(jax.device_get(losses))),
-                **figures,
-                "seconds": round(time.perf_counter() - started, 2),
-            }
-        )
-        if epochs_since_best(history) == 0:
-            best = jax.device_get(state.variables)
-            export()
-        finished = (
-            len(history) == settings.epochs or epochs_since_best(history) >= settings.patience
-        )
-        store.save(state, best, history, last=finished)
-        write_log(history, out)
-        bar.set_postfix_str(f"loss {figures['loss']:.4f}, quality {figures['quality']:.3f}")
-    store.close()
-    model = export()
+    model = export(best, history)
     try:
         plot_curves(history, out / "curves.png", f"{config.task} {config.kind}")
     except ModuleNotFoundError:

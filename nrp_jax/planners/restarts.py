@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -25,6 +26,7 @@ def search_with_restarts(
     tree: Tree,
     *,
     folded: Folded | None = None,
+    accept: Callable[[np.ndarray], bool] | None = None,
     key: jax.Array,
     termination: Termination,
     time_limit_s: float,
@@ -38,6 +40,8 @@ def search_with_restarts(
         policy: the planner.
         tree: from ``policy.init``; every search begins with it.
         folded: postures of the first search, which is by drive; None to do without.
+        accept: whether a path (P, D) may be kept, such as the exact check; None to keep any. A path
+            whose shortcuts are refused is asked for as it was found.
         key: random key.
         termination: of all searches together; they go on after the goal is reached.
         time_limit_s: wall time of searches and shortcuts without compilation [s].
@@ -74,9 +78,13 @@ def search_with_restarts(
         if raw is not None:
             started = time.perf_counter()
             short = shortcut(finer, raw, key=jax.random.fold_in(key, attempt))
+            for one in (short, raw):
+                length = path_length(finer, one)
+                if length < cost and (accept is None or accept(one)):
+                    best, path, cost = found, one, length
+                    break
             seconds += time.perf_counter() - started
-            if (length := path_length(finer, short)) < cost:
-                best, path, cost = found, short, length
+            rows[:, COST] = np.maximum(rows[:, COST], cost)  # what was refused is no path
             rows = np.vstack([rows, [iterations, seconds, *rows[-1, 2:4], cost, rows[-1, 5]]])
         history = np.vstack([history, rows])
         over = seconds >= time_limit_s or iterations >= int(termination.max_iterations)

@@ -7,13 +7,15 @@ import pytest
 
 import nrp_jax
 from nrp_jax.config import PlannerConfig
+from nrp_jax.homes.houses import generate_house
 from nrp_jax.learning.experience_database import Database
 from nrp_jax.learning.similarity import LATENT, MARGIN, Siamese
 from nrp_jax.planner import plan
-from nrp_jax.planners.by_name import policy_of
+from nrp_jax.planners.by_name import check_names, policy_of
 from nrp_jax.planners.cvae import CVAERRT, CVAEInformedRRTStar
 from nrp_jax.retrieval import SIGMA, UNIFORM_SHARE, ExperienceSampler, Mixture
-from nrp_jax.samplers import load_sampler
+from nrp_jax.samplers import load_sampler, packaged_file
+from nrp_jax.scene.world import batch_is_free
 
 pytestmark = pytest.mark.light_compilation
 REST = [0.1, 1.3, 1.4, -0.2, 1.7, 0.0, 1.6, 0.0]
@@ -78,6 +80,22 @@ def test_planners_draw_from_what_is_retrieved(home, database):
     q = np.asarray(jax.jit(CVAERRT.sample)(policy, world, to, tree, jax.random.key(0)))
     from_mixture = np.abs(q[:, 3:] - REST).max(axis=1) < 5 * SIGMA
     assert from_mixture.mean() == pytest.approx(1 - UNIFORM_SHARE, abs=0.15)
+
+
+def test_the_packaged_database_knows_where_an_unseen_home_is_free():
+    robot, grid = nrp_jax.load_robot("fetch"), generate_house(1_000_030, kind="fetch").grid
+    world = nrp_jax.build_world(robot, grid)
+    uniform = jax.random.uniform(
+        jax.random.key(0), (1024, 11), minval=world.lower, maxval=world.upper
+    )
+    free = np.asarray(batch_is_free(world, uniform))
+    start, goal = np.asarray(uniform)[free][:2]
+    mixture = load_sampler("fetch", "fire").retrieve(world, start, goal)
+    assert int(mixture.num) > 100
+    drawn = mixture.draw(world, start, goal, 1024, jax.random.key(1))
+    assert np.asarray(batch_is_free(world, drawn)).mean() > 1.5 * free.mean()
+    assert {"fire", "fire-star"} <= {*check_names("fetch", None)}
+    assert packaged_file("fetch", "fire").stat().st_size < 10e6
 
 
 @pytest.mark.parametrize("planner", ["fire", "fire-star"])

@@ -1,5 +1,7 @@
 """FIRE's experiences: parts and entries by hand, a network that learns, and files."""
 
+import flax.linen as nn
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -23,12 +25,12 @@ from nrp_jax.learning.shards import DatasetSettings
 from nrp_jax.learning.similarity import (
     LATENT,
     MARGIN,
+    Convolution,
     FireSettings,
     contrastive_loss,
     cut,
     train_fire,
 )
-from nrp_jax.scene.world import batch_is_free, build_world
 
 pytestmark = pytest.mark.light_compilation
 REST = [0.1, 1.3, 1.4, -0.2, 1.7, 0.0, 1.6, 0.0]
@@ -48,8 +50,8 @@ def home(boxed):
 
 @pytest.fixture(scope="module")
 def dataset():
-    """Three homes in each of which samples stand in the same places."""
-    places = np.array([[2.0, 1.2, 0.0], [1.6, 1.3, 0.3], [0.5, 0.5, 0.0]])
+    """Three homes in each of which samples stand in the same places; a box is in one of them."""
+    places = np.array([[2.0, 1.2, 0.0], [0.9, 0.9, 0.3], [0.5, 0.5, 0.0]])
     waypoint = np.concatenate([places, np.tile(REST, (3, 1))], axis=1).astype(np.float32)
     rows = {
         "q_start": waypoint[[0] * 9],
@@ -85,42 +87,40 @@ def test_parts_overlap_and_are_full():
     assert part[0, :3, :3].all() and not part[0, 3:].any() and not part[0, :, 3:].any()
 
 
-def test_entries_are_seen_from_the_parts_that_they_are_in(dataset, entries):
-    cells = np.floor(dataset.rows["waypoint"][:, :2] / 0.1)
-    wanted = sum(
-        int(np.all((corner <= cell) & (cell < corner + SIDE)))
-        for cell in cells
-        for corner in corners_of_parts((30, 25))
-    )
-    assert len(entries) == wanted
-    assert np.abs(entries.sample[:, :2]).max() <= SIDE / 2 * 0.1
-    back = entries.sample[:, :2] + middles(entries.corner, 0.1)
-    there = dataset.rows["waypoint"][:, :2]
-    assert all(np.abs(there - place).sum(axis=1).min() < 1e-5 for place in back)
-    shift = entries.sample[:, :2] - entries.start[:, :2]
-    assert np.abs(shift).max() < 2.5  # both are seen from the same place
+def test_entries_are_seen_from_the_parts_that_have_them_in_their_middle(dataset, entries):
+    # Two of each home: no part has its middle nearer than 1 m to a wall.
+    np.testing.assert_array_equal(entries.home, [0, 0, 1, 1, 2, 2])
+    np.testing.assert_array_equal(entries.corner, [[10, 0], [0, 0]] * 3)
+    np.testing.assert_allclose(entries.sample[:2, :2], [[0.0, 0.2], [-0.1, -0.1]], atol=1e-5)
+    shift = middles(entries.corner, 0.1)
+    np.testing.assert_allclose(entries.start[:, :2] + shift, [[2.0, 1.2]] * 6, atol=1e-5)
+    np.testing.assert_allclose(entries.goal[:, :2] + shift, [[0.9, 0.9]] * 6, atol=1e-5)
+    np.testing.assert_array_equal(entries.sample[0, 2:], dataset.rows["waypoint"][0, 2:])
 
 
-def test_alike_are_near_samples_that_would_do_for_each_other(fetch, dataset, entries):
+def test_alike_are_samples_that_would_do_for_each_other(fetch, dataset, entries):
     pairs = make_pairs(fetch, dataset.grids, entries, np.random.default_rng(0), 60)
-    assert 0 < pairs.alike.sum() <= len(pairs.alike) / 2 + 1
-    homes, samples = entries.home[pairs.index], entries.sample[pairs.index]
+    assert 0 < pairs.alike.sum() == len(pairs.alike) / 2
+    homes = entries.home[pairs.index]
     assert np.all(homes[:, 0] != homes[:, 1])
-    for index, alike in zip(pairs.index[:20], pairs.alike[:20], strict=True):
-        a, b = (entries[row] for row in (index[:1], index[1:]))
-        free = []
-        for sample, part in ((a, b), (b, a)):
-            q = sample.sample.copy()
-            q[:, :2] += middles(part.corner, 0.1)
-            world = build_world(fetch, dataset.grids[int(part.home[0])])
-            free.append(bool(batch_is_free(world, jnp.asarray(q))[0]))
-        if alike:
-            assert all(free)
-    near = np.linalg.norm(np.diff(samples[pairs.alike], axis=1)[:, 0, :2], axis=1)
-    assert near.max() <= 0.5
-    with pytest.raises(ValueError, match="of one home; expected two or more"):
-        own = entries[entries.home == 0]
-        make_pairs(fetch, dataset.grids, own, np.random.default_rng(0), 8)
+    # In the middle of the part with the box only what stands a little aside is free.
+    is_boxed = (entries.home == 1) & (entries.corner[:, 0] == 0)
+    is_there = entries.sample[:, 1] < 0
+    blocked = is_boxed[pairs.index].any(axis=1) & is_there[pairs.index].all(axis=1)
+    np.testing.assert_array_equal(pairs.alike, ~blocked)
+    for wrong, words in ((entries.home == 0, "of one home"), (~is_boxed, "are alike; expected")):
+        with pytest.raises(ValueError, match=words):
+            make_pairs(fetch, dataset.grids, entries[wrong], np.random.default_rng(0), 8)
+
+
+@pytest.mark.parametrize("side, stride", [(20, 2), (10, 2), (5, 1)])
+def test_convolutions_are_those_of_flax(side, stride):
+    x = jax.random.normal(jax.random.key(0), (2, side, side, side, 3))
+    ours, flax = Convolution(stride), nn.Conv(16, (3, 3, 3), stride)
+    variables = flax.init(jax.random.key(1), x)
+    kernel = variables["params"]["kernel"].reshape(-1, 16)
+    found = ours.apply({"params": {**variables["params"], "kernel": kernel}}, x)
+    np.testing.assert_allclose(found, flax.apply(variables, x), atol=1e-5)
 
 
 def test_the_loss_draws_together_and_drives_apart_up_to_the_margin():
@@ -141,7 +141,7 @@ def test_far_goals_are_moved_nearer(fetch):
 
 def test_a_training_goes_on_and_its_database_is_read(fetch, dataset, entries, tmp_path, capsys):
     shared = {
-        "settings": FireSettings(epochs=3, batch=8, pairs=80),
+        "settings": FireSettings(epochs=3, batch=8, pairs=400),
         "stamp": "x",
         "progress": False,
     }

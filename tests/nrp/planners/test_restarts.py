@@ -52,3 +52,28 @@ def test_the_shortest_path_is_kept_until_the_budget_ends():
     np.testing.assert_array_equal(path[[0, -1]], [START, GOAL])
     assert path_length(world, path) == pytest.approx(cost[-1], rel=1e-5)
     assert found.stopped in (StopReason.REACHED, StopReason.ITERATIONS)
+
+
+def test_what_is_refused_is_no_path():
+    world = nrp_jax.build_world(
+        nrp_jax.load_robot("snake"), nrp_jax.Grid(occupied=np.zeros((50, 40), bool))
+    )
+    goal = nrp_jax.ConfigurationGoal(q=jnp.asarray(GOAL))
+    policy = NRPConnect(sampler=Unasked(), straight_iterations=1000)
+    shared = {"termination": make_termination(0.0, max_iterations=24), "time_limit_s": 60.0}
+    tree, asked = policy.init(world, goal, START[None], 4096), []
+
+    def second(path):
+        asked.append(path)
+        return len(asked) == 2
+
+    found, path = search_with_restarts(
+        world, goal, policy, tree, accept=second, key=jax.random.key(0), **shared
+    )
+    np.testing.assert_array_equal(path, asked[1])
+    cost = found.history[:, 4]
+    np.testing.assert_allclose(cost[np.isfinite(cost)][-1], path_length(world, path), rtol=1e-5)
+    found, path = search_with_restarts(
+        world, goal, policy, tree, accept=lambda _: False, key=jax.random.key(0), **shared
+    )
+    assert path is None and not np.isfinite(found.history[:, 4]).any()
