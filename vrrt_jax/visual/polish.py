@@ -24,7 +24,7 @@ from vrrt_jax.scene.world import World
 from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.images import cut_goal
 from vrrt_jax.splat.types import Camera, SplatModel
-from vrrt_jax.visual.distinct import MIN_SEPARATION, distances_to, distinct
+from vrrt_jax.visual.distinct import distances_to, distinct
 from vrrt_jax.visual.goal import CloseUp
 from vrrt_jax.visual.least_squares import (
     PAYS,
@@ -50,6 +50,7 @@ SETTLE_STEPS = 8  # at most, on the large images
 PROMISING = 6.0  # times the least cost; ends that cost more, and do not match, are left
 RIVALS = 2.0  # times the least cost; ends that cost more on the fine image are left
 TWINNED = 2  # best ends whose kinematic twins, and half turns of the hand, are looked at
+SAME_END = 0.1  # [rad] half turns of a hand this near to an end are that end
 TURNS = 12  # in which the last joint goes all the way round
 TURNED = 3  # times as many ends of these turns as are kept
 SECOND_SPREAD = 0.5  # how far samples spread in the second round, in units of the others
@@ -226,7 +227,7 @@ def _settled_with_hand(world: World, polishing: Polishing, close_up: CloseUp, en
     weight = polishing.threshold / threshold
     ends = _distinct_ends(world, _settled_together(world, fine, goal, weight, ends), num)
     turned = nearer_turns(world, half_turned(world, ends.q[:TWINNED]), np.asarray(fine.prior.q))
-    turned = turned[[np.min(distances_to(world, ends.q, q)) > MIN_SEPARATION for q in turned]]
+    turned = turned[[np.min(distances_to(world, ends.q, q)) > SAME_END for q in turned]]
     if not len(turned):
         return ends
     turned = _settled_together(world, fine, goal, weight, derivatives(world, fine, turned))
