@@ -73,7 +73,7 @@ def plan_by_loss(
                 # It ended before its loss could be compared with the other's.
                 best = dataclasses.replace(result, status=other.status, advice=other.advice)
             else:
-                best = min(result, other, key=_rank)
+                best = other if _is_better(other, result, config.match.ambiguity) else result
             result = with_time_of(best, result, other)
     return result
 
@@ -82,10 +82,13 @@ def _has_strange_colors(result: PlanResult) -> bool:
     return result.ok and result.colored_loss > result.match_threshold
 
 
-def _rank(result: PlanResult) -> tuple[bool, float]:
-    """Solved plans come first; of these, and of the others, the better matches."""
-    known = result.ok and np.isfinite(result.colored_loss)
-    return not result.ok, result.colored_loss if known else result.loss
+def _is_better(other: PlanResult, result: PlanResult, ambiguity: float) -> bool:
+    """Whether a later attempt came to more. What looks the same is no better."""
+    if other.ok != result.ok:
+        return other.ok
+    if other.ok and np.isfinite(other.colored_loss):
+        return ambiguity * other.colored_loss < result.colored_loss
+    return other.loss < result.loss
 
 
 def promising_roots(world: World, goal: Goal, key: jax.Array, num: int) -> np.ndarray:
