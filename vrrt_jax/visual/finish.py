@@ -30,8 +30,9 @@ MAX_REPLANS = 3  # paths that the exact check may refuse before it has the last 
 MARGIN_STEP = 0.01  # [m] by which each of them keeps farther away than the one before
 UNTOLD = 0.3  # [rad] or [m] joints that may be off by more are named
 # A near match is likelier: goals are taken to be as dense as distance ** -joints, which favors no
-# scale. A factor of e in density is worth as much as this share of a threshold in cost.
+# scale. A factor of e in density is worth as much as a cost that is lower by this share.
 NEARNESS = 0.03
+TINY = 1e-6  # share of a threshold; costs below that are equal
 NEAR = 0.1  # [rad] all that are nearer are as likely
 SAME_LOSS = 1.05  # losses within this factor are the same match
 
@@ -212,7 +213,9 @@ def _polished_ends(
     least = np.min(polished.cost, where=fits, initial=np.inf)
     alike = fits & (polished.cost <= config.match.ambiguity * least)
     far = np.maximum(distances_to(world, polished.q, q_start), NEAR)
-    weighed = polished.cost + NEARNESS * threshold * len(q_start) * np.log(far)
+    weighed = np.log(np.maximum(polished.cost, TINY * threshold)) + NEARNESS * len(
+        q_start
+    ) * np.log(far)
     order = np.lexsort([np.where(alike, weighed, polished.cost), ~alike, ~fits])
     rivals = [int(k) for k in order if np.isfinite(polished.cost[k])]
     matched = [k for k in rivals if polished.loss[k] <= threshold]
