@@ -18,6 +18,8 @@ from vrrt_jax.core.search import COST, SearchResult, StopReason, Termination
 from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import Tree
 
+MOST_REFINED = 2  # times that checks become twice as fine, while every path is refused
+
 
 def search_with_restarts(
     world: GridWorld,
@@ -39,9 +41,11 @@ def search_with_restarts(
         goal: where to.
         policy: the planner.
         tree: from ``policy.init``; every search begins with it.
-        folded: postures of the first search, which is by drive; None to do without.
+        folded: postures of the first searches, which are by drive until a path is kept; None to do
+            without.
         accept: whether a path (P, D) may be kept, such as the exact check; None to keep any. A path
-            whose shortcuts are refused is asked for as it was found.
+            whose shortcuts are refused is asked for as it was found. If that is refused too, later
+            searches check twice as finely, at most :data:`MOST_REFINED` times.
         key: random key.
         termination: of all searches together; they go on after the goal is reached.
         time_limit_s: wall time of searches and shortcuts without compilation [s].
@@ -52,7 +56,7 @@ def search_with_restarts(
         found one. The history has the length of the shortest path so far, with its shortcuts.
     """
     finer = dataclasses.replace(world, resolution=world.resolution / 2)
-    best, path, cost = None, None, np.inf
+    best, path, cost, refined = None, None, np.inf, 0
     iterations, nodes, seconds, compile_s = 0, 0, 0.0, 0.0
     history = np.zeros((0, 6))
     for attempt in itertools.count():
@@ -62,7 +66,7 @@ def search_with_restarts(
             goal,
             policy,
             tree,
-            folded=None if attempt else folded,
+            folded=folded if path is None else None,
             key=jax.random.fold_in(key, attempt),
             termination=dataclasses.replace(termination, max_iterations=left),
             time_limit_s=time_limit_s - seconds,
@@ -83,6 +87,11 @@ def search_with_restarts(
                 if length < cost and (accept is None or accept(one)):
                     best, path, cost = found, one, length
                     break
+            if path is None and refined < MOST_REFINED:
+                world, refined = (
+                    dataclasses.replace(world, resolution=world.resolution / 2),
+                    refined + 1,
+                )
             seconds += time.perf_counter() - started
             rows[:, COST] = np.maximum(rows[:, COST], cost)  # what was refused is no path
             rows = np.vstack([rows, [iterations, seconds, *rows[-1, 2:4], cost, rows[-1, 5]]])
