@@ -19,6 +19,7 @@ from nrp_jax.planners.decomposed import search_decomposed, shortcut_legs
 from nrp_jax.planners.drive import folded_postures
 from nrp_jax.planners.nrp_connect import NRPConnect, default_planner
 from nrp_jax.planners.restarts import search_with_restarts
+from nrp_jax.planners.shorten import shorten
 from nrp_jax.scene.configurations import check_configuration
 from nrp_jax.scene.exact import ExactScene, verify
 from nrp_jax.scene.nearest import shifted, working_world
@@ -34,7 +35,6 @@ from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import STATUS_OF, PlanResult, Status
 from vrrt_jax.core.search import SearchResult, make_termination, no_search, search
 from vrrt_jax.core.settings import check_settings
-from vrrt_jax.core.shortcut import shortcut
 from vrrt_jax.core.types import ExpansionPolicy
 
 ATTEMPTS = 3  # each checks edges twice as finely as the one before, whose path touched something
@@ -124,7 +124,7 @@ def plan(
     if policy.goal_score(goal) == -np.inf:
         world = dataclasses.replace(world, resolution=world.resolution / 2)
     tree = policy.init(world, goal, np.asarray(start)[None], config.capacity)
-    shorten = shortcut_legs if planner == DECOMPOSED else shortcut
+    shorter = shortcut_legs if planner == DECOMPOSED else shorten
     scene = scene or ExactScene(robot, grid)
     if starts_at(goal, world, start):
         found = no_search(policy, goal, tree)
@@ -155,7 +155,7 @@ def plan(
             )
             check_extracted_path(policy, path, np.asarray(start))
             raw = np.asarray(start)[None] if path is None else path
-            results.append(_finish(scene, world, places, goal, raw, found, key, shorten))
+            results.append(_finish(scene, world, places, goal, raw, found, key, shorter))
             tried += results[-1].expansions
             spent.update(results[-1].timing)
             rejected.update(results[-1].rejected)
@@ -282,14 +282,14 @@ def _finish(
     raw: np.ndarray,
     found: SearchResult,
     key: jax.Array,
-    shorten: Callable[..., np.ndarray] = shortcut,
+    shorter: Callable[..., np.ndarray] = shorten,
 ) -> PlanResult:
     """Shorten and verify what a search found, ``raw`` (P, D)."""
     loss, threshold = float(goal.loss(world, jnp.asarray(raw[-1]))), float(goal.threshold)
     check = functools.partial(_checked, scene, world, places)
     if loss <= threshold:
         finer = dataclasses.replace(world, resolution=world.resolution / 2)
-        done = postprocess(finer, raw, check, key=key, shorten=shorten)
+        done = postprocess(finer, raw, check, key=key, shorten=shorter)
         status = Status.SOLVED if done.is_verified else Status.NOT_VERIFIED
     else:
         done = unchecked(raw, trajectory_of(world, raw))

@@ -14,6 +14,7 @@ import numpy as np
 
 from nrp_jax.homes.grid import Grid
 from nrp_jax.planners.hybrid_astar import drive
+from nrp_jax.planners.shorten import shorten
 from nrp_jax.scene.car_world import CarWorld
 from nrp_jax.scene.grid_world import GridWorld
 from nrp_jax.scene.world import batch_is_free
@@ -21,7 +22,7 @@ from vrrt_jax.core.edges import Space
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners.informed_rrt_star import InformedRRTStar
 from vrrt_jax.core.search import COST, SearchResult, StopReason, Termination, no_search, search
-from vrrt_jax.core.shortcut import path_length, shortcut
+from vrrt_jax.core.shortcut import path_length
 from vrrt_jax.core.types import Tree
 
 # Torso [m] and arm [rad] at rest: all of the robot is within 0.3 m of the middle of its base.
@@ -168,7 +169,7 @@ def _sum_of(base: np.ndarray, *arms: np.ndarray, seconds: float) -> np.ndarray:
 
 
 def shortcut_legs(world: Space, path: np.ndarray, *, key: jax.Array, **options: Any) -> np.ndarray:
-    """Shorten each leg of a decomposed path (P, D) by itself, see :func:`shortcut`.
+    """Shorten each leg of a decomposed path (P, D) by itself, see :func:`shorten`.
 
     The base's leg goes from the first to the last waypoint at which the arm rests.
     """
@@ -176,7 +177,7 @@ def shortcut_legs(world: Space, path: np.ndarray, *, key: jax.Array, **options: 
     first, last = (int(at_rest[0]), int(at_rest[-1])) if len(at_rest) else (0, 0)
     parts = path[: first + 1], path[first : last + 1], path[last:]
     short = [
-        shortcut(world, part, key=jax.random.fold_in(key, leg), **options)
+        shorten(world, part, key=jax.random.fold_in(key, leg), **options)
         for leg, part in enumerate(parts)
     ]
     return np.concatenate([short[0], short[1][1:], short[2][1:]])

@@ -12,10 +12,11 @@ import numpy as np
 from nrp_jax.planners.by_drive import search_by_drive
 from nrp_jax.planners.drive import Folded
 from nrp_jax.planners.nrp_connect import NRPConnect
+from nrp_jax.planners.shorten import shorten
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.search import COST, SearchResult, StopReason, Termination
-from vrrt_jax.core.shortcut import path_length, shortcut
+from vrrt_jax.core.shortcut import path_length
 from vrrt_jax.core.types import Tree
 
 MOST_REFINED = 2  # times that checks become twice as fine, while every path is refused
@@ -81,7 +82,7 @@ def search_with_restarts(
         nodes, compile_s = nodes + int(found.tree.size), compile_s + found.compile_s
         if raw is not None:
             started = time.perf_counter()
-            short = shortcut(finer, raw, key=jax.random.fold_in(key, attempt))
+            short = shorten(finer, raw, key=jax.random.fold_in(key, attempt))
             for one in (short, raw):
                 length = path_length(finer, one)
                 if length < cost and (accept is None or accept(one)):

@@ -110,6 +110,49 @@ def _round(world: Space, path: _Path, key: jax.Array) -> _Path:
     )
 
 
+def prune(world: Space, path: np.ndarray) -> np.ndarray:
+    """Leave out waypoints of a path: from each, on to the last that a free edge leads to.
+
+    Every corner costs a robot time, and random shortcuts leave many of a path of many. No path gets
+    longer.
+
+    Args:
+        world: robot and obstacles.
+        path: (P, D) free of collisions.
+
+    Returns:
+        (P', D) some of these waypoints, both ends among them.
+    """
+    path = np.asarray(path, np.float32)
+    if len(path) < 3:
+        return path
+    kept = np.asarray(_kept(world, padded(path), np.int32(len(path))))
+    return path[kept[: len(path)]]
+
+
+@host_jit
+def _kept(world: Space, q: jax.Array, size: jax.Array) -> jax.Array:
+    """Which waypoints (P,) bool a pruned path has."""
+    room = len(q)
+    length = world.length(world.edge(q[:-1], q[1:]))
+    along = jnp.concatenate([jnp.zeros(1), jnp.cumsum(length)])
+    farthest_first = jnp.arange(room - 1, -1, -1)
+
+    def step(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        at, kept = state
+        q_from = jnp.broadcast_to(q[at], q.shape)
+        edge = world.edge(q_from, q[farthest_first])
+        tried = (farthest_first > at + 1) & (farthest_first < size)
+        tried &= world.is_resolved(edge, EDGE_STEPS)
+        tried &= world.length(edge) <= along[farthest_first] - along[at]
+        row = first_free_edge(world, q_from, edge, EDGE_STEPS, tried)
+        at = jnp.where(row < room, farthest_first[jnp.minimum(row, room - 1)], at + 1)
+        return at, kept.at[at].set(True)
+
+    start = jnp.int32(0), jnp.zeros(room, bool).at[0].set(True)
+    return jax.lax.while_loop(lambda state: state[0] < size - 1, step, start)[1]
+
+
 def without_repeats(world: StraightLineEdges, path: np.ndarray) -> np.ndarray:
     """The path (P, D) without waypoints that repeat the one before; its ends stay.
 
