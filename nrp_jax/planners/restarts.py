@@ -89,10 +89,8 @@ def search_with_restarts(
                     best, path, cost = found, one, length
                     break
             if path is None and refined < MOST_REFINED:
-                world, refined = (
-                    dataclasses.replace(world, resolution=world.resolution / 2),
-                    refined + 1,
-                )
+                world = dataclasses.replace(world, resolution=world.resolution / 2)
+                refined += 1
             seconds += time.perf_counter() - started
             rows[:, COST] = np.maximum(rows[:, COST], cost)  # what was refused is no path
             rows = np.vstack([rows, [iterations, seconds, *rows[-1, 2:4], cost, rows[-1, 5]]])

@@ -213,9 +213,8 @@ def _polished_ends(
     least = np.min(polished.cost, where=fits, initial=np.inf)
     alike = fits & (polished.cost <= config.match.ambiguity * least)
     far = np.maximum(distances_to(world, polished.q, q_start), NEAR)
-    weighed = np.log(np.maximum(polished.cost, TINY * threshold)) + NEARNESS * len(
-        q_start
-    ) * np.log(far)
+    sparsity = len(q_start) * np.log(far)
+    weighed = np.log(np.maximum(polished.cost, TINY * threshold)) + NEARNESS * sparsity
     order = np.lexsort([np.where(alike, weighed, polished.cost), ~alike, ~fits])
     rivals = [int(k) for k in order if np.isfinite(polished.cost[k])]
     matched = [k for k in rivals if polished.loss[k] <= threshold]
