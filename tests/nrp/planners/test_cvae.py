@@ -34,21 +34,6 @@ class Always:
         return jnp.broadcast_to(self.q, (num, len(self.q)))
 
 
-@pytest.fixture(scope="module")
-def snake():
-    return nrp_jax.load_robot("snake")
-
-
-@pytest.fixture(scope="module")
-def home(snake):
-    """Two rooms and a door of one meter."""
-    occupied = np.zeros((50, 40), bool)
-    occupied[24:26] = True
-    occupied[24:26, 25:35] = False
-    grid = nrp_jax.Grid(occupied=occupied)
-    return grid, nrp_jax.build_world(snake, grid), ExactScene(snake, grid)
-
-
 @pytest.mark.parametrize("make", [CVAERRT, CVAEInformedRRTStar])
 def test_shares_of_samples(home, make):
     """Uniform ones by their share; those that are too far to shorten a path are not taken."""
@@ -98,7 +83,7 @@ def test_packaged_samples_follow_paths_in_an_unseen_home(task):
 
 
 def test_it_plans_through_the_door(snake, home):
-    grid, world, scene = home
+    (grid, world), scene = home, ExactScene(snake, home[0])
     budget = {"capacity": 2048, "max_expansions": 1600, "goal_bias": 0.2}
     result = plan(
         snake,

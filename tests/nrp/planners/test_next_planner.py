@@ -35,21 +35,6 @@ class EastGuide:
         return jnp.broadcast_to((q + action)[:, None], (len(q), num, q.shape[1]))
 
 
-@pytest.fixture(scope="module")
-def snake():
-    return nrp_jax.load_robot("snake")
-
-
-@pytest.fixture(scope="module")
-def home(snake):
-    """Two rooms and a door of one meter."""
-    occupied = np.zeros((50, 40), bool)
-    occupied[24:26] = True
-    occupied[24:26, 25:35] = False
-    grid = nrp_jax.Grid(occupied=occupied)
-    return grid, nrp_jax.build_world(snake, grid)
-
-
 def test_it_follows_its_guide_to_the_wall_and_counts_what_failed(home):
     """One lane goes east in steps of a quarter of a meter, until the wall blocks it."""
     policy = NEXTPlanner(
