@@ -106,3 +106,26 @@ def test_rrt_connect_gives_up_a_sixteenth_of_blocked_edges_however_fine_they_are
         world = dataclasses.replace(wall_world, resolution=jnp.float32(resolution))
         policy = PLANNERS["rrt-connect"].for_world(world)
         assert (policy.edge_steps, policy.edge_slack) == (steps, steps // 16)
+
+
+def test_rrt_connect_samples_around_its_roots_at_all_scales(wall_world, connected):
+    policy = RRTConnect.for_world(wall_world, lanes=256)
+    sample = np.asarray(policy._samples(wall_world, connected.tree, jax.random.key(0)))
+    lane = np.arange(256)
+    is_at_root = (lane // 2 % 4 == 1) & (lane // 8 % 2 == 0)
+    roots = np.asarray(connected.tree.q)[lane % 2]
+    apart = np.linalg.norm(sample - roots, axis=1)[is_at_root]
+    assert len(apart) == 32 and apart.min() >= 1 / 3 - 1e-3 and apart.max() <= 3 + 1e-3
+    assert apart.min() < 0.6 and apart.max() > 2.0
+
+
+def test_rrt_connect_of_an_arm_keeps_nothing_of_blocked_edges_to_the_other_tree(
+    wall_world, connected
+):
+    goal = ConfigurationGoal(q=jnp.asarray(GOAL))
+    for policy, kept in ((RRTConnect.for_world(wall_world), False), (RRTConnect(), True)):
+        tree = policy.init(wall_world, goal, START[None], 64)
+        proposals = policy.propose(wall_world, goal, tree, jax.random.key(0))
+        connects = np.asarray(proposals.aux.connects)
+        assert connects.any() and not connects.all()
+        assert np.all(np.asarray(proposals.partial) == (kept | ~connects))

@@ -47,6 +47,7 @@ class RRTConnect:
     """
 
     MAX_STEP: ClassVar[float] = 2.56  # [rad] long, as edges are free in large pieces or not at all
+    SCALES: ClassVar[float] = 3.0  # the margin times and over this: how far local samples are
     SLACK: ClassVar[float] = 1 / 16  # of an edge that is blocked
 
     margin: Any = 1.0  # how far from the ends half of the samples are drawn [rad]
@@ -54,12 +55,17 @@ class RRTConnect:
     edge_steps: int = static(default=128)
     # Sub-steps by which a blocked edge is cut before it has to be: the last ones cost most checks.
     edge_slack: int = static(default=0)
+    keep_partial: bool = static(default=True)  # the free part of a blocked edge to the other tree
 
     @classmethod
     def for_world(cls, world: Space, **settings: Any) -> Self:
-        """The planner with steps of the same length, however fine the world's checks are."""
+        """The planner with steps of the same length, however fine the world's checks are.
+
+        It saves checks next to what edges run into, as those of an arm cost most there.
+        """
         steps = num_checks(world, cls.MAX_STEP)
-        return cls(edge_steps=steps, edge_slack=int(cls.SLACK * steps), **settings)
+        slack = int(cls.SLACK * steps)
+        return cls(edge_steps=steps, edge_slack=slack, keep_partial=False, **settings)
 
     def init(
         self, world: Space, goal: ConfigurationGoal, q_roots: Any, capacity: int
@@ -136,22 +142,9 @@ class RRTConnect:
         connects = jnp.concatenate([jnp.zeros(half, bool), newest >= 0])
         chosen = jnp.concatenate([jnp.zeros(half, jnp.int32), newest])
 
-        # The others extend towards samples. Half of the samples are near the start and the first
-        # goal: where limits are far apart, few others serve.
-        q_start, q_goal = world.normalize(tree.q[:2])
-        ends = jnp.stack([q_start, world.end(q_start, world.edge(q_start, q_goal))])
-        lower = jnp.maximum(world.lower, jnp.min(ends, axis=0) - self.margin)
-        upper = jnp.minimum(world.upper, jnp.max(ends, axis=0) + self.margin)
-        key_near, key_far = jax.random.split(key)
-        sample_shape = (self.lanes, lower.shape[0])
-        sample = jnp.where(
-            (lane // 2 % 2 == 0)[:, None],
-            jax.random.uniform(key_near, sample_shape, minval=lower, maxval=upper),
-            sample_configurations(world, key_far, self.lanes),
-        )
-
         # A connecting lane goes from its node to the nearest of the other tree, an extending lane
         # from the nearest node of its own tree to its sample; these take turns between the trees.
+        sample = self._samples(world, tree, key)
         aim = jnp.where(connects[:, None], tree.q[chosen], sample)
         side = jnp.where(connects, 1 - node.side[chosen], lane % 2)
         nearest = trees.nearest(world, tree, aim, label=node.side, wanted=side)
@@ -160,7 +153,7 @@ class RRTConnect:
             parent=parent,
             target=jnp.where(connects[:, None], tree.q[nearest], aim),
             valid=jnp.ones(self.lanes, bool),
-            partial=jnp.ones(self.lanes, bool),
+            partial=self.keep_partial | ~connects,
             aux=ConnectLanes(
                 connects=connects,
                 nearest=nearest,
@@ -168,6 +161,33 @@ class RRTConnect:
                 side=node.side[parent],
             ),
         )
+
+    def _samples(self, world: Space, tree: Tree[ConnectNode], key: jax.Array) -> jax.Array:
+        """Configurations (B, D) to extend to, of three kinds.
+
+        Half of them are near the start and the first goal: where limits are far apart, few others
+        serve. A quarter is around nodes, half of those around either root, at distances of all
+        scales: these lead out of narrow places. The others are anywhere.
+        """
+        lane, num_joints = jnp.arange(self.lanes), world.lower.shape[0]
+        near, far, node, way, apart = jax.random.split(key, 5)
+        q_start, q_goal = world.normalize(tree.q[:2])
+        ends = jnp.stack([q_start, world.end(q_start, world.edge(q_start, q_goal))])
+        lower = jnp.maximum(world.lower, jnp.min(ends, axis=0) - self.margin)
+        upper = jnp.minimum(world.upper, jnp.max(ends, axis=0) + self.margin)
+        shape = self.lanes, num_joints
+        near_ends = jax.random.uniform(near, shape, minval=lower, maxval=upper)
+
+        nodes = jax.random.randint(node, shape[:1], 0, tree.size)
+        center = tree.q[jnp.where(lane // 8 % 2 == 0, lane % 2, nodes)]
+        direction = jax.random.normal(way, shape)
+        direction /= jnp.linalg.norm(direction, axis=1, keepdims=True)
+        exponent = jax.random.uniform(apart, (self.lanes, 1), minval=-1.0, maxval=1.0)
+        local = center + self.margin * self.SCALES**exponent * direction
+
+        kind = (lane // 2 % 4)[:, None]
+        sample = jnp.where(kind == 1, local, sample_configurations(world, far, self.lanes))
+        return jnp.where(kind % 2 == 0, near_ends, sample)
 
     def evaluate(self, world: Space, goal: ConfigurationGoal, q: jax.Array, proposals: Proposals):
         """0 for children that arrived; the distance left, or a large number, for the others."""
