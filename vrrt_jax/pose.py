@@ -22,7 +22,7 @@ from vrrt_jax.robots.bodies import moving_body
 from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.verify import contacts
-from vrrt_jax.scene.world import World, keeping_clearance
+from vrrt_jax.scene.world import World, batch_is_free, keeping_clearance
 from vrrt_jax.visual.distinct import distances_to, distinct
 
 REACHED_M = 1e-4  # a link this near to its pose is there
@@ -76,6 +76,31 @@ def inverse_kinematics(
         Unreached: there is none; a ValueError that says how near the link gets, or that all are in
             collision.
     """
+    return _solutions(robot, (world,), pose, link, key, q_near, num)
+
+
+def _solutions(
+    robot: Robot,
+    rooms: tuple[World, ...],
+    pose: np.ndarray,
+    link: str | None,
+    key: jax.Array,
+    q_near: np.ndarray | None,
+    num: int,
+) -> np.ndarray:
+    """See :func:`inverse_kinematics`; of a round's solutions those free in the first of the rooms.
+
+    If there are none, those free in the second, and so on.
+
+    Args:
+        robot: whose kinematics it is.
+        rooms: worlds that differ in their margins, the most wanted first.
+        pose: (4, 4) [m].
+        link: a moving body, or None.
+        key: random key.
+        q_near: (D,) or None.
+        num: at most so many.
+    """
     link = robot.link_names[-1] if link is None else link
     index, in_link = moving_body(robot, link)
     target = jnp.asarray(rigid(pose, "the pose") @ np.linalg.inv(in_link), jnp.float32)
@@ -83,16 +108,17 @@ def inverse_kinematics(
     nearest, least = q_near, np.inf
     reached = 0
     for k in range(ROUNDS):
-        places = _places(world, jnp.asarray(q_near), jax.random.fold_in(key, k), k == 0)
-        q, meters, radians, free = (
-            np.asarray(a) for a in _descend(world, target, jnp.int32(index), places)
+        places = _places(rooms[0], jnp.asarray(q_near), jax.random.fold_in(key, k), k == 0)
+        q, meters, radians = (
+            np.asarray(a) for a in _descend(rooms[0], target, jnp.int32(index), places)
         )
         there = (meters <= REACHED_M) & (radians <= REACHED_RAD)
         reached += int(np.sum(there))
-        if np.any(there & free):
-            rows = np.flatnonzero(there & free)
-            rows = rows[np.argsort(distances_to(world, q[rows], q_near), kind="stable")]
-            return q[distinct(world, q, rows, num)]
+        for room in rooms:
+            rows = np.flatnonzero(there & np.asarray(batch_is_free(room, q)))
+            if len(rows):
+                rows = rows[np.argsort(distances_to(room, q[rows], q_near), kind="stable")]
+                return q[distinct(room, q, rows, num)]
         away = meters + ARM_M * radians + 1e3 * ~there * np.any(there)
         if np.min(away) < least:
             nearest, least = q[np.argmin(away)], np.min(away)
@@ -100,8 +126,8 @@ def inverse_kinematics(
     if not reached:
         told = f"'{link}' stays {missed} from the pose; move it to where the arm reaches"
         raise Unreached(told, nearest)
-    touching = contacts(robot, world, nearest) or contacts(
-        robot, world, nearest, geometry="spheres"
+    touching = contacts(robot, rooms[-1], nearest) or contacts(
+        robot, rooms[-1], nearest, geometry="spheres"
     )
     raise Unreached(
         f"all {reached} configurations that take '{link}' there are in collision, one of them: "
@@ -150,20 +176,16 @@ def plan_to_pose(
     key_goals, key = jax.random.split(key)
     # Goals with room around them are better, if there are any.
     wary = keeping_clearance(world, q_start[None], config.path.margin)
-    goals = None
-    for room in (wary, world) if wary is not world else (world,):
-        try:
-            goals = inverse_kinematics(robot, room, pose, link, key=key_goals, q_near=q_start)
-            break
-        except Unreached as error:
-            unreached = error
-    if goals is None:
+    rooms = (world,) if wary is world else (wary, world)
+    try:
+        goals = _solutions(robot, rooms, pose, link, key_goals, q_start, GOALS)
+    except Unreached as error:
         goal = ConfigurationGoal(q=jnp.asarray(q_start))
         tree = policy.init(world, goal, q_start[None], config.tree.capacity)
-        chosen = Chosen(path=None, target=unreached.nearest, loss=np.inf, threshold=1.0)
+        chosen = Chosen(path=None, target=error.nearest, loss=np.inf, threshold=1.0)
         found = no_search(policy, goal, tree)
         result = finish(robot, world, found, chosen, q_start, key, config)
-        return dataclasses.replace(result, status=Status.NO_MATCH, advice=str(unreached))
+        return dataclasses.replace(result, status=Status.NO_MATCH, advice=str(error))
     # As many every time, so that nothing compiles anew: the rest repeat the nearest.
     goals = np.concatenate([goals, np.repeat(goals[:1], GOALS - len(goals), axis=0)])
     goal = ConfigurationGoal(q=jnp.asarray(goals))
@@ -183,8 +205,8 @@ def _places(world: World, q_near: jax.Array, key: jax.Array, with_near: bool) ->
 @host_jit
 def _descend(
     world: World, pose: jax.Array, link: jax.Array, q: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Levenberg-Marquardt from (S, D): ends, their errors [m] and [rad], and whether free."""
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Levenberg-Marquardt from (S, D): ends, and their errors [m] and [rad]."""
 
     def residual(q: jax.Array) -> jax.Array:
         # Matrices in place of angles: no turn is singular.
@@ -217,4 +239,4 @@ def _descend(
 
     damping = jnp.full(len(q), 1e-3)
     q = jax.lax.while_loop(goes_on, descend, (jnp.int32(0), q, damping))[1]
-    return q, *errors(q), jax.vmap(world.is_free)(q)
+    return q, *errors(q)
