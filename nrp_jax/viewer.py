@@ -113,12 +113,13 @@ def _page(
         page.add_mesh("map", *map_mesh(grid.flatten() if robot.planar else grid), _MAP)
         every = np.linspace(0, len(trajectory) - 1, min(PICTURES, len(trajectory))).astype(int)
         model = mujoco.MjModel.from_xml_string(robot.xml)
-        page.add_motion(model, trajectory[every], groups=range(mujoco.mjNGROUP))
+        page.add_robot(model, groups=range(mujoco.mjNGROUP))
+        page.show_trajectory(trajectory[every])
         child = nodes.edges(MOST_EDGES)
         colors = colors_of(nodes.score[child])
-        page.add_lines("tree", _lifted(base_lines(world, nodes, child)), colors, 1.0)
-        page.add_lines("path", _lifted(trajectory[None, :, :2]), np.array(_PATH), 4.0)
-        page.add_numbers(numbers)
+        page.show_lines("tree", _lifted(base_lines(world, nodes, child)), colors, 1.0)
+        page.show_lines("path", _lifted(trajectory[None, :, :2]), np.array(_PATH), 4.0)
+        page.show_numbers(numbers)
         # From the south, high above the middle of the map.
         middle = np.array([*grid.origin[:2], 0.0]) + grid.size * [0.5, 0.5, 0.0]
         page.look_from(middle + grid.size[:2].max() * np.array([0.0, -0.6, 0.9]), middle)

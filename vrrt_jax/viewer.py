@@ -1,15 +1,19 @@
 """A plan in the browser: the robot along its path, the tree it grew, the goal beside the end."""
 
 import dataclasses
+import itertools
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from vrrt_jax import planner
+from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.edges import difference
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import PlanResult
@@ -19,10 +23,12 @@ from vrrt_jax.report import outcome
 from vrrt_jax.robots import Robot
 from vrrt_jax.robots.kinematics import batch_link_poses
 from vrrt_jax.robots.mesh_sources import mesh_spec
+from vrrt_jax.scene.movable import MovableObstacles
 from vrrt_jax.scene.page import Page, colors_of
-from vrrt_jax.scene.world import World, obstacle_list
+from vrrt_jax.scene.world import World, obstacle_list, with_obstacles
 from vrrt_jax.splat.camera import shrunk, squared
 from vrrt_jax.splat.mujoco_images import OBSTACLE_GROUP, VISUAL_GROUPS, MeshRenderer
+from vrrt_jax.splat.types import Camera
 from vrrt_jax.visual.goal import ImageGoal
 from vrrt_jax.viz import ScenePainter, along, over_sky
 
@@ -51,30 +57,34 @@ class _Plan:
 
 
 @single_precision
-def view(result: PlanResult, world: World, goal: Any = None, *, port: int | None = None) -> Page:
+def view(
+    result: PlanResult,
+    world: World,
+    goal: Any = None,
+    *,
+    config: PlannerConfig | None = None,
+    port: int | None = None,
+) -> Page:
     """Show a plan on a page in the browser, which only this machine can reach.
 
     The last expression of a notebook's cell shows itself. A script calls ``view(...).serve()``,
-    which waits until Ctrl-C.
+    which waits until Ctrl-C. With a goal, obstacles can be dragged, and a button plans again among
+    them, from the same start.
 
     Args:
         result: from :func:`vrrt_jax.plan` or :func:`vrrt_jax.plan_to_configuration`.
         world: that it was planned in.
         goal: that it was planned to; of an :class:`ImageGoal` the first image is shown beside the
             end of the path.
+        config: settings of plans that the page asks for, the default ones if None.
         port: of 127.0.0.1; a free one if None.
 
     Raises:
         ModuleNotFoundError: viser is not installed.
         OSError: the port is taken.
     """
-    plan = _Plan(
-        path=result.path,
-        raw_path=result.raw_path,
-        nodes=nodes_of(result.tree),
-        numbers=outcome(world, result),
-    )
-    return _page(plan, world, goal, port)
+    page = Page(f"{world.robot.value.name}: {result.status.name}", port)
+    return _filled(page, _plan_of(world, result), world, goal, config)
 
 
 @single_precision
@@ -89,7 +99,7 @@ def view_folder(folder: Path, *, port: int | None = None) -> Page:
         raise FileNotFoundError(
             f"no plan at '{folder}': it has no result.json; write one with: vrrt plan --out FOLDER"
         )
-    # Nothing is planned here: the engine that loads fastest does.
+    # The engine that loads fastest, and plans fastest if the page asks for that.
     problem = load_problem(folder / "problem", engine="closed_form")
     try:
         with np.load(folder / "path.npz") as file:
@@ -102,50 +112,87 @@ def view_folder(folder: Path, *, port: int | None = None) -> Page:
         nodes=load_nodes(folder / "tree.npz"),
         numbers=read_json(folder / "result.json"),
     )
-    return _page(plan, problem.world, problem.goal, port)
+    page = Page(f"{problem.robot.name}: {plan.numbers['status']}", port)
+    return _filled(page, plan, problem.world, problem.goal, None)
 
 
-def _page(plan: _Plan, world: World, goal: Any, port: int | None) -> Page:
-    robot: Robot = world.robot.value
-    page = Page(f"{robot.name}: {plan.numbers['status']}", port)
+def _plan_of(world: World, result: PlanResult) -> _Plan:
+    return _Plan(
+        path=result.path,
+        raw_path=result.raw_path,
+        nodes=nodes_of(result.tree),
+        numbers=outcome(world, result),
+    )
+
+
+def _filled(page: Page, plan: _Plan, world: World, goal: Any, config: PlannerConfig | None) -> Page:
+    """The page with all that it shows; closed if that fails."""
     try:
-        model, groups = _model(robot, world)
-        trajectory = along(world, plan.path, PICTURES)
-        page.add_motion(model, trajectory, groups)
-        _add_lines(page, plan, world, trajectory)
-        if isinstance(goal, ImageGoal):
-            _add_pictures(page, goal, world, plan.path[-1])
-        else:
-            tip = _tips(robot, plan.path[-1:])[0]
-            page.look_from(tip + np.array([1.2, 1.2, 0.8]), tip)
-        told = {name: plan.numbers[name] for name in _TOLD if plan.numbers.get(name) is not None}
-        page.add_numbers({name: value for name, value in told.items() if value != ""})
+        page.add_robot(*_model(world))
+        _show(page, plan, world, goal)
+        page.obstacles = MovableObstacles(page, obstacle_list(world), movable=goal is not None)
+        if goal is not None:
+            _offer_plans(page, world, goal, plan.path[0], config)
+        _look(page, world, goal, plan.path[-1])
     except BaseException:
         page.close()
         raise
     return page
 
 
-def _model(robot: Robot, world: World) -> tuple[mujoco.MjModel, tuple[int, ...]]:
-    """Robot, obstacles and held objects, and the groups to draw: true meshes, or spheres."""
+def _show(page: Page, plan: _Plan, world: World, goal: Any) -> None:
+    """All that depends on the plan, in place of what was shown before."""
+    trajectory = along(world, plan.path, PICTURES)
+    page.show_trajectory(trajectory)
+    _show_lines(page, plan, world, trajectory)
+    if isinstance(goal, ImageGoal):
+        _show_pictures(page, goal, world, plan.path[-1])
+    told = {name: plan.numbers[name] for name in _TOLD if plan.numbers.get(name) is not None}
+    page.show_numbers({name: value for name, value in told.items() if value != ""})
+
+
+def _offer_plans(
+    page: Page, world: World, goal: Any, q_start: np.ndarray, config: PlannerConfig | None
+) -> None:
+    """A button that plans again, among the obstacles where they stand then."""
+    asked = itertools.count(1)
+
+    def plan_again(say: Callable[[str], None]) -> None:
+        say("planning")
+        moved = with_obstacles(world, page.obstacles.obstacles)
+        run: dict[str, Any] = {"key": jax.random.key(next(asked)), "config": config}
+        run["on_progress"] = lambda _, seconds: say(f"planning: {seconds:.1f} s")
+        try:
+            result = planner.plan(world.robot.value, moved, goal, q_start, **run)
+        except ValueError as error:  # an obstacle where the robot stands, for example
+            page.show_numbers({"status": "not planned", "advice": str(error)})
+        else:
+            _show(page, _plan_of(moved, result), moved, goal)
+
+    page.add_button("plan again", plan_again)
+
+
+def _model(world: World) -> tuple[mujoco.MjModel, tuple[int, ...]]:
+    """Robot and held objects, and the groups to draw: true meshes, or spheres."""
+    robot: Robot = world.robot.value
     spec, groups = mesh_spec(robot), VISUAL_GROUPS
     if spec is None:
         spec, groups = mujoco.MjSpec.from_string(robot.xml), (_SURFACE_GROUP,)
-    model = MeshRenderer(spec, obstacle_list(world), world.attached).model
+    model = MeshRenderer(spec, [], world.attached).model
     return model, (*groups, OBSTACLE_GROUP)
 
 
-def _add_lines(page: Page, plan: _Plan, world: World, trajectory: np.ndarray) -> None:
+def _show_lines(page: Page, plan: _Plan, world: World, trajectory: np.ndarray) -> None:
     """The tree by loss, its way to the goal, and the path, as places of the hand."""
     robot, nodes = world.robot.value, plan.nodes
     child = nodes.best_edges(MOST_EDGES)
     # On a scale of powers of ten, as in the figures.
     colors = colors_of(np.log10(nodes.score[child] + 1e-9))
     start, end = nodes.q[nodes.parent[child]], nodes.q[child]
-    page.add_lines("best of the tree (strong: low loss)", _curves(world, start, end), colors, 1.0)
+    page.show_lines("best of the tree (strong: low loss)", _curves(world, start, end), colors, 1.0)
     raw = plan.raw_path
-    page.add_lines("way in the tree", _curves(world, raw[:-1], raw[1:]), np.array(_WAY), 3.0)
-    page.add_lines("path", _tips(robot, trajectory)[None], np.array(_PATH), 5.0)
+    page.show_lines("way in the tree", _curves(world, raw[:-1], raw[1:]), np.array(_WAY), 3.0)
+    page.show_lines("path", _tips(robot, trajectory)[None], np.array(_PATH), 5.0)
 
 
 def _curves(world: World, start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -164,16 +211,28 @@ def _tips(robot: Robot, q: np.ndarray) -> np.ndarray:
     return pose[:, :3, :3] @ tip + pose[:, :3, 3]
 
 
-def _add_pictures(page: Page, goal: ImageGoal, world: World, q_end: np.ndarray) -> None:
-    """The first goal image and the end of the path, as its camera sees it, which looks first."""
-    cameras, images, _ = goal.views
-    camera = squared(cameras[0])
-    camera = shrunk(camera, max(1, round(camera.height / PICTURE_PX)))
+def _show_pictures(page: Page, goal: ImageGoal, world: World, q_end: np.ndarray) -> None:
+    """The first goal image, and the end of the path as its camera sees it."""
+    camera = _small_camera(goal)
     painter = ScenePainter(world.robot.value, world, goal.self_model, camera)
-    end, wanted = painter.paint(q_end), over_sky(images[0], (camera.width, camera.height))
-    page.add_picture("goal image | end of the path", np.concatenate([wanted, end], axis=1))
-    # Look from the camera, at what lies as deep as the hand.
+    wanted = over_sky(goal.views[1][0], (camera.width, camera.height))
+    both = np.concatenate([wanted, painter.paint(q_end)], axis=1)
+    page.show_picture("goal image | end of the path", both)
+
+
+def _small_camera(goal: ImageGoal) -> Camera:
+    camera = squared(goal.views[0][0])
+    return shrunk(camera, max(1, round(camera.height / PICTURE_PX)))
+
+
+def _look(page: Page, world: World, goal: Any, q_end: np.ndarray) -> None:
+    """Look from the goal's camera at what lies as deep as the hand; else at the hand."""
+    tip = _tips(world.robot.value, q_end[None])[0]
+    if not isinstance(goal, ImageGoal):
+        page.look_from(tip + np.array([1.2, 1.2, 0.8]), tip)
+        return
+    camera = _small_camera(goal)
     pose = np.linalg.inv(np.asarray(camera.world_to_cam, float))
-    tip, fovy = _tips(world.robot.value, q_end[None])[0], camera.height / float(camera.focal)
+    fovy = camera.height / float(camera.focal)
     depth = max((tip - pose[:3, 3]) @ pose[:3, 2], 0.1)
     page.look_from(pose[:3, 3], pose[:3, 3] + depth * pose[:3, 2], 2 * np.arctan(fovy / 2))

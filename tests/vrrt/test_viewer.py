@@ -38,7 +38,8 @@ def page():
 
 def test_the_slider_moves_the_robot(page):
     model = mujoco.MjModel.from_xml_string(ARM)
-    page.add_motion(model, np.array([[0.0], [np.pi / 4], [np.pi / 2]]), groups=(0,))
+    page.add_robot(model, groups=(0,))
+    page.show_trajectory(np.array([[0.0], [np.pi / 4], [np.pi / 2]]))
     hand = page.moving[model.body("hand").id]
     np.testing.assert_allclose(hand.position, [1, 0, 0], atol=1e-6)
     page.slider.value = 2
@@ -76,6 +77,33 @@ def test_a_plan_shows_tree_path_and_numbers():
         assert len(page.moving) >= problem.robot.num_joints
         assert page.slider.max > 1
         assert page.url in page._repr_html_()
+    finally:
+        page.close()
+
+
+def test_obstacles_are_dragged_and_the_page_plans_again_among_them():
+    problem = load_problem("panda_posts", engine="closed_form")
+    goal = vrrt_jax.ConfigurationGoal(q=problem.true_goal)
+    run = (problem.robot, problem.world, goal, problem.q_start)
+    result = vrrt_jax.plan(*run, key=jax.random.key(0))
+    page = vrrt_jax.view(result, problem.world, goal)
+    try:
+        before = page.slider.max, len(page.moving)
+        *others, name = [obstacle.name for obstacle in page.obstacles.obstacles]
+        page.obstacles.move(name, np.array([0.9, -0.9, 0.2]), np.array([1.0, 0, 0, 0]))
+        page.buttons["plan again"]()
+        assert (page.slider.max, len(page.moving)) == before
+        table = page._shown["table"].content
+        assert "SOLVED" in table
+        # Inside the robot: nothing is planned, and the page says so.
+        page.obstacles.move(name, np.array([0.0, 0.0, 0.5]), np.array([1.0, 0, 0, 0]))
+        page.buttons["plan again"]()
+        table = page._shown["table"].content
+        assert "not planned" in table and name in table
+        moved = {o.name: o.position for o in page.obstacles.obstacles}
+        assert moved[name] == (0.0, 0.0, 0.5) and len(moved) == 1 + len(others)
+        # The world that was given stays as it was.
+        assert obstacle_list(problem.world)[-1].position != (0.0, 0.0, 0.5)
     finally:
         page.close()
 

@@ -1,10 +1,13 @@
 """The bodies of a MuJoCo model as triangle meshes in color, for pages and other programs."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
+
+from vrrt_jax.scene.obstacle_kinds import KINDS
+from vrrt_jax.scene.obstacles import Obstacle
 
 PLANE_HALF_M = 2.0  # [m] half the side of the square that is drawn of a plane
 _PLANE_THICK_M = 0.004  # [m]
@@ -30,6 +33,21 @@ def body_mesh(model: mujoco.MjModel, body: int, groups: Collection[int]) -> Any:
     return trimesh.util.concatenate(meshes) if meshes else None
 
 
+def obstacle_mesh(obstacle: Obstacle) -> Any:
+    """An obstacle in its own frame, as :func:`body_mesh` has bodies in theirs."""
+    import trimesh
+
+    kind = KINDS[obstacle.kind]
+    mesh = _PRIMITIVES[kind.geom](trimesh.creation, np.asarray(kind.geom_size(obstacle.size)))
+    return _colored(mesh, obstacle.rgba)
+
+
+def _colored(mesh: Any, rgba: Sequence[float] | np.ndarray) -> Any:
+    color = np.round(255 * np.clip(rgba, 0, 1)).astype(np.uint8)
+    mesh.visual.vertex_colors = np.tile(color, (len(mesh.vertices), 1))
+    return mesh
+
+
 def _geom_mesh(model: mujoco.MjModel, geom: int) -> Any:
     """A geom in the frame of its body, in its material's color or its own."""
     import trimesh
@@ -46,7 +64,7 @@ def _geom_mesh(model: mujoco.MjModel, geom: int) -> Any:
         )
     material = int(model.geom_matid[geom])
     rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
-    mesh.visual.vertex_colors = np.round(255 * np.clip(rgba, 0, 1)).astype(np.uint8)
+    _colored(mesh, rgba)
     pose = np.eye(4)
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])

@@ -19,6 +19,7 @@ HOST = "127.0.0.1"
 FRAMES_PER_S = 30
 # Colors of a value from the lowest, which is the best, to the highest, which hides nothing.
 _SCALE = np.array([[0, 110, 60], [0, 130, 160], [150, 185, 220], [225, 228, 238]])
+_TABLE = "table"
 _TABLE_STYLE = "font-size:0.8em;line-height:1.35;padding:0 0.8em;overflow-wrap:anywhere"
 
 
@@ -46,8 +47,15 @@ class Page:
         self._server.scene.set_up_direction("+z")
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._closed, self._playing = threading.Event(), threading.Event()
-        self.slider: Any = None  # along the path, once there is a motion
-        self.moving: dict[int, Any] = {}  # bodies that move, by number in the model
+        self._shown: dict[str, Any] = {}  # lines, pictures and the table, by name
+        self._boxes: dict[str, Any] = {}  # that hide lines
+        self._model: mujoco.MjModel | None = None
+        self._bodies: dict[int, Any] = {}  # all that are drawn, by number in the model
+        self._poses: Any = None  # (T, nbody, 3) and (T, nbody, 4) along the path
+        self._play: Any = None  # the button
+        self.slider: Any = None  # along the path, once there is one
+        self.buttons: dict[str, Callable[[], None]] = {}  # what they do, by label
+        self.obstacles: Any = None  # see ``movable.MovableObstacles``
 
     @property
     def host(self) -> str:
@@ -64,54 +72,69 @@ class Page:
         """The scene of viser, to add things to."""
         return self._server.scene
 
+    @property
+    def gui(self) -> Any:
+        """The panel of viser, to add boxes and buttons to."""
+        return self._server.gui
+
+    @property
+    def moving(self) -> dict[int, Any]:
+        """Bodies that move, by number in the model."""
+        return {body: handle for body, handle in self._bodies.items() if body}
+
     def look_from(self, eye: np.ndarray, target: np.ndarray, fovy: float = 0.8) -> None:
         """Look from a place (3,) to another [m] at first, with a vertical field of view [rad]."""
         camera = self._server.initial_camera
         camera.up, camera.fov = (0.0, 0.0, 1.0), fovy
         camera.position, camera.look_at = tuple(map(float, eye)), tuple(map(float, target))
 
-    def add_motion(
-        self, model: mujoco.MjModel, trajectory: np.ndarray, groups: Collection[int]
-    ) -> None:
-        """Add a robot with what stands around it, and a slider and a button that move it.
+    def add_robot(self, model: mujoco.MjModel, groups: Collection[int]) -> None:
+        """Add a robot, with what is fixed to its world.
 
         Args:
-            model: a compiled model; what is fixed to its world stands still.
-            trajectory: (T, D) configurations, a picture each [rad] or [m].
+            model: a compiled model.
             groups: of the geoms that are drawn.
         """
-        position, quaternion = _body_poses(model, trajectory)
-        frames = []
+        self._model = model
         for body in range(model.nbody):
             mesh = body_mesh(model, body, groups)
-            if mesh is None:
-                continue
-            handle = self.scene.add_mesh_trimesh(f"/bodies/{body}", mesh)
-            handle.position, handle.wxyz = position[0, body], quaternion[0, body]
-            if body:
-                frames.append((body, handle))
+            if mesh is not None:
+                self._bodies[body] = self.scene.add_mesh_trimesh(f"/bodies/{body}", mesh)
 
-        def show(step: int) -> None:
-            with self._server.atomic():
-                for body, handle in frames:
-                    handle.position, handle.wxyz = position[step, body], quaternion[step, body]
+    def show_trajectory(self, trajectory: np.ndarray) -> None:
+        """Let the robot of :meth:`add_robot` go along a path, by a slider and a button.
 
-        self.slider = self._add_player(len(trajectory), show)
-        self.moving = dict(frames)
+        Args:
+            trajectory: (T, D) configurations, a picture each [rad] or [m]; it takes the place of
+                the one before.
+        """
+        self._playing.clear()
+        self._poses = _body_poses(self._model, trajectory)
+        slider = self.slider = self.slider or self._add_player()
+        last = len(trajectory) - 1
+        slider.max, slider.disabled, slider.value = max(last, 1), not last, 0
+        self._play.disabled = not last
+        self._pose(0)
 
-    def _add_player(self, num: int, show: Callable[[int], None]) -> Any:
-        """A slider over ``num`` pictures, and a button that plays them; the slider."""
-        gui, last = self._server.gui, num - 1
-        slider = gui.add_slider("along the path", 0, max(last, 1), 1, 0, disabled=not last)
-        button = gui.add_button("play", disabled=not last)
-        slider.on_update(lambda _: show(min(int(slider.value), last)))
+    def _pose(self, step: int) -> None:
+        position, quaternion = self._poses
+        step = min(step, len(position) - 1)
+        with self._server.atomic():
+            for body, handle in self._bodies.items():
+                handle.position, handle.wxyz = position[step, body], quaternion[step, body]
+
+    def _add_player(self) -> Any:
+        """A slider along the path, and a button that plays it; the slider."""
+        slider = self.gui.add_slider("along the path", 0, 1, 1, 0)
+        self._play = button = self.gui.add_button("play")
+        slider.on_update(lambda _: self._pose(int(slider.value)))
 
         @button.on_click
         def _(_: Any) -> None:
             if self._playing.is_set():
                 self._playing.clear()
                 return
-            if slider.value >= last:
+            if slider.value >= slider.max:
                 slider.value = 0
             self._playing.set()
 
@@ -119,8 +142,8 @@ class Page:
             while not self._closed.wait(1 / FRAMES_PER_S):
                 if not self._playing.is_set():
                     continue
-                slider.value = min(int(slider.value) + 1, last)
-                if slider.value >= last:
+                slider.value = min(int(slider.value) + 1, slider.max)
+                if slider.value >= slider.max:
                     self._playing.clear()
 
         threading.Thread(target=play, daemon=True).start()
@@ -134,8 +157,8 @@ class Page:
             f"/{name}", vertices, faces, color=color, flat_shading=True, side="double"
         )
 
-    def add_lines(self, name: str, lines: np.ndarray, colors: np.ndarray, width: float) -> None:
-        """Add lines as one object, with a box to tick that hides it.
+    def show_lines(self, name: str, lines: np.ndarray, colors: np.ndarray, width: float) -> None:
+        """Show lines as one object, in place of those of that name, with a box that hides them.
 
         Args:
             name: what they are.
@@ -144,31 +167,71 @@ class Page:
             width: on the screen [px].
         """
         pieces = np.stack([lines[:, :-1], lines[:, 1:]], axis=2)  # (E, P - 1, 2, 3)
+        each = np.broadcast_to(np.asarray(colors, np.uint8).reshape(-1, 1, 1, 3), pieces.shape)
+        if name in self._shown:
+            self._shown.pop(name).remove()
         if not pieces.size:
             return
-        each = np.broadcast_to(np.asarray(colors, np.uint8).reshape(-1, 1, 1, 3), pieces.shape)
-        handle = self.scene.add_line_segments(
+        lines = self._shown[name] = self.scene.add_line_segments(
             f"/{name}",
             pieces.reshape(-1, 2, 3).astype(np.float32),
             each.reshape(-1, 2, 3),
             thickness=width,
             thickness_units="screen",
         )
-        box = self._server.gui.add_checkbox(name, True)
-        box.on_update(lambda _: setattr(handle, "visible", box.value))
+        if name not in self._boxes:
+            self._boxes[name] = self._add_box(name)
+        lines.visible = self._boxes[name].value
 
-    def add_picture(self, label: str, picture: np.ndarray) -> None:
-        """Add a picture (H, W, 3) uint8 below what is there."""
-        self._server.gui.add_image(picture, label=label)
+    def _add_box(self, name: str) -> Any:
+        """A box that hides the lines of a name, whichever are shown."""
+        box = self.gui.add_checkbox(name, True)
 
-    def add_numbers(self, numbers: Mapping[str, Any]) -> None:
-        """Add a table of names and values below what is there."""
+        @box.on_update
+        def _(_: Any) -> None:
+            if name in self._shown:
+                self._shown[name].visible = box.value
+
+        return box
+
+    def add_button(self, label: str, act: Callable[[Callable[[str], None]], None]) -> None:
+        """Add a button that can be pressed again when it is done.
+
+        Args:
+            label: of the button.
+            act: what it does; is given a function that shows another label meanwhile.
+        """
+        button = self.gui.add_button(label)
+
+        def press(_: Any = None) -> None:
+            button.disabled = True
+            try:
+                act(lambda text: setattr(button, "label", text))
+            finally:
+                button.disabled, button.label = False, label
+
+        button.on_click(press)
+        self.buttons[label] = press
+
+    def show_picture(self, label: str, picture: np.ndarray) -> None:
+        """Show a picture (H, W, 3) uint8, in place of the one of that label."""
+        if label in self._shown:
+            self._shown[label].image = picture
+        else:
+            self._shown[label] = self.gui.add_image(picture, label=label)
+
+    def show_numbers(self, numbers: Mapping[str, Any]) -> None:
+        """Show a table of names and values, in place of the one before."""
         rows = "".join(
             f'<tr><td style="white-space:nowrap">{html.escape(name)}</td>'
             f"<td><b>{html.escape(_words(value))}</b></td></tr>"
             for name, value in numbers.items()
         )
-        self._server.gui.add_html(f'<div style="{_TABLE_STYLE}"><table>{rows}</table></div>')
+        content = f'<div style="{_TABLE_STYLE}"><table>{rows}</table></div>'
+        if _TABLE in self._shown:
+            self._shown[_TABLE].content = content
+        else:
+            self._shown[_TABLE] = self.gui.add_html(content)
 
     def serve(self) -> None:
         """Say where the page is, wait until Ctrl-C, then end the page."""
