@@ -129,10 +129,10 @@ def _filled(page: Page, plan: _Plan, world: World, goal: Any, config: PlannerCon
     """The page with all that it shows; closed if that fails."""
     try:
         page.add_robot(*_model(world))
-        _show(page, plan, world, goal)
         page.obstacles = MovableObstacles(page, obstacle_list(world), movable=goal is not None)
         if goal is not None:
             _offer_plans(page, world, goal, plan.path[0], config)
+        _show(page, plan, world, goal)
         _look(page, world, goal, plan.path[-1])
     except BaseException:
         page.close()

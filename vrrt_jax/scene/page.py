@@ -53,7 +53,7 @@ class Page:
         self._bodies: dict[int, Any] = {}  # all that are drawn, by number in the model
         self._poses: Any = None  # (T, nbody, 3) and (T, nbody, 4) along the path
         self._play: Any = None  # the button
-        self.slider: Any = None  # along the path, once there is one
+        self.slider: Any = None  # along the path, once there is a robot
         self.buttons: dict[str, Callable[[], None]] = {}  # what they do, by label
         self.obstacles: Any = None  # see ``movable.MovableObstacles``
 
@@ -100,6 +100,7 @@ class Page:
             mesh = body_mesh(model, body, groups)
             if mesh is not None:
                 self._bodies[body] = self.scene.add_mesh_trimesh(f"/bodies/{body}", mesh)
+        self._add_player()
 
     def show_trajectory(self, trajectory: np.ndarray) -> None:
         """Let the robot of :meth:`add_robot` go along a path, by a slider and a button.
@@ -110,8 +111,7 @@ class Page:
         """
         self._playing.clear()
         self._poses = _body_poses(self._model, trajectory)
-        slider = self.slider = self.slider or self._add_player()
-        last = len(trajectory) - 1
+        slider, last = self.slider, len(trajectory) - 1
         slider.max, slider.disabled, slider.value = max(last, 1), not last, 0
         self._play.disabled = not last
         self._pose(0)
@@ -123,9 +123,9 @@ class Page:
             for body, handle in self._bodies.items():
                 handle.position, handle.wxyz = position[step, body], quaternion[step, body]
 
-    def _add_player(self) -> Any:
-        """A slider along the path, and a button that plays it; the slider."""
-        slider = self.gui.add_slider("along the path", 0, 1, 1, 0)
+    def _add_player(self) -> None:
+        """A slider along the path, and a button that plays it."""
+        slider = self.slider = self.gui.add_slider("along the path", 0, 1, 1, 0)
         self._play = button = self.gui.add_button("play")
         slider.on_update(lambda _: self._pose(int(slider.value)))
 
@@ -147,7 +147,6 @@ class Page:
                     self._playing.clear()
 
         threading.Thread(target=play, daemon=True).start()
-        return slider
 
     def add_mesh(
         self, name: str, vertices: np.ndarray, faces: np.ndarray, color: tuple[int, int, int]
