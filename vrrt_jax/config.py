@@ -55,13 +55,12 @@ class PolishConfig:
     """Least squares after the search, which tells apart what the small images cannot."""
 
     hypotheses: int = setting(4, 0, 1024)  # best nodes polished; 0 = none (re-compiles)
-    samples: int = setting(256, 1, 65536)  # around them in each round, and as many drawn anew
+    samples: int = setting(256, 1, 65536)  # around them, and as many drawn anew
     lanes: int = setting(32, 1, 1024)  # best samples, which descend
     kept: int = setting(8, 1, 1024)  # distinct ends that go on
-    rounds: int = setting(4, 1, 1024)  # of sampling and descending, until there is a match
-    spread: float = setting(0.8, 0.0)  # of a joint, half of that in the second round [rad]
-    steps: int = setting(4, 0, 1024)  # Levenberg-Marquardt, in each round
-    coarse_px: int = setting(64, 8, 4096)  # image height in these rounds (re-compiles)
+    spread: float = setting(0.8, 0.0)  # of a joint [rad]
+    steps: int = setting(4, 0, 1024)  # Levenberg-Marquardt
+    coarse_px: int = setting(64, 8, 4096)  # image height at first (re-compiles)
     px: int = setting(128, 8, 4096)  # image height at the end (re-compiles)
     close_px: int = setting(480, 0, 4096)  # image height that a close-up is cut from; 0 = none
     # Weight of the prior toward the start: added loss per rad^2, in units of the match threshold.

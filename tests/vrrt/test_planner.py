@@ -52,7 +52,7 @@ def test_plan_finds_the_pose_and_new_numbers_do_not_retrace(
     )
     before = searches._chunk._cache_size()
     assert 1 <= before <= 2  # one of the visual search, one of the connection to its match
-    few = {"budget.max_iterations": 4, "budget.attempts": 1, "polish.rounds": 1}
+    few = {"budget.max_iterations": 4, "budget.attempts": 1}
     run(world=moved, changes=few)
     run(image=picture(panda, self_model, camera, Q_GOAL + 0.1), changes=few)
     run(q_start=Q_START + 0.1, changes=few)
@@ -119,9 +119,7 @@ def test_goals_are_visited_in_turn(panda, self_model, camera, image, open_world)
 
 
 def test_the_short_form_is_an_image_goal(panda, self_model, camera, image, open_world):
-    config = vrrt_jax.PlannerConfig().changed(
-        {"budget.max_iterations": 3, "budget.attempts": 1, "polish.rounds": 1}
-    )
+    config = vrrt_jax.PlannerConfig().changed({"budget.max_iterations": 3, "budget.attempts": 1})
     mask = np.ones(image.shape[:2], bool)
     mask[360:] = False
     run: dict = {"key": jax.random.key(3), "config": config}

@@ -30,7 +30,6 @@ ABLATIONS = {
         "lineages.steps": (1,),
         "lineages.num": (16, 1),
         "polish.hypotheses": (0, 1),
-        "polish.rounds": (1,),
         "polish.close_px": (0,),
         "polish.start_prior": (0.0,),
         "match.ambiguity": (1.0,),

@@ -3,11 +3,10 @@
 Many configurations look nearly like the goal: half a turn of a gripper, another elbow, a wrist that
 makes up for another. Each is a local minimum of the loss, which gradients do not leave. So samples
 spread widely around the best nodes of a search: some joints move a little, or the outer joints,
-which the image tells last, are drawn anew. The best descend by Levenberg-Marquardt. Where none
-matches, the distinct ends start the next round. Then the best settle on a larger image with more
-splats, which tells what the small one does not, and at last on a close-up of the hand beside it,
-where half a turn becomes visible. What no image tells stays near the start: a weak prior sees to
-that.
+which the image tells last, are drawn anew. The best descend by Levenberg-Marquardt. Then the best
+settle on a larger image with more splats, which tells what the small one does not, and at last on a
+close-up of the hand beside it, where half a turn becomes visible. What no image tells stays near
+the start: a weak prior sees to that.
 """
 
 import dataclasses
@@ -53,7 +52,6 @@ TWINNED = 2  # best ends whose kinematic twins, and half turns of the hand, are 
 SAME_END = 0.1  # [rad] half turns of a hand this near to an end are that end
 TURNS = 12  # in which the last joint goes all the way round
 TURNED = 3  # times as many ends of these turns as are kept
-SECOND_SPREAD = 0.5  # how far samples spread in the second round, in units of the others
 LEAST_COVERED = 0.01  # share of a close-up; a hand that is hidden tells nothing
 
 
@@ -148,21 +146,15 @@ def compile_polishing(world: World, polishing: Polishing) -> None:
 def _search_around(
     world: World, polishing: Polishing, q: np.ndarray, rng: np.random.Generator
 ) -> Ends:
-    """Rounds on small images, until one matches: sample, descend, keep distinct ends."""
+    """Distinct ends on small images: sample, descend, settle."""
     config, soft, coarse = polishing.config, polishing.soft, polishing.coarse
-    for k in range(config.rounds):
-        spread = config.spread * (SECOND_SPREAD if k == 1 else 1.0)
-        around = sample_around(world, q, config.samples, spread, rng)
-        samples = np.concatenate([around, redraw_outer(world, q, config.samples, rng)])
-        samples = nearer_turns(world, samples, np.asarray(soft.prior.q))
-        cost = evaluate_each(world, soft, samples)[1]
-        best = samples[np.argsort(cost, kind="stable")[: config.lanes]]
-        ends = _distinct_ends(world, descend(world, soft, best, config.steps), config.kept)
-        ends = _distinct_ends(world, _settled(world, coarse, ends.q), config.kept)
-        if np.any(ends.free & (ends.cost <= float(coarse.goal.threshold))):
-            break
-        q = ends.q
-    return ends
+    around = sample_around(world, q, config.samples, config.spread, rng)
+    samples = np.concatenate([around, redraw_outer(world, q, config.samples, rng)])
+    samples = nearer_turns(world, samples, np.asarray(soft.prior.q))
+    cost = evaluate_each(world, soft, samples)[1]
+    best = samples[np.argsort(cost, kind="stable")[: config.lanes]]
+    ends = _distinct_ends(world, descend(world, soft, best, config.steps), config.kept)
+    return _distinct_ends(world, _settled(world, coarse, ends.q), config.kept)
 
 
 def _promising(ends: Ends, objective: Objective) -> Ends:

@@ -34,7 +34,7 @@ def finished(tree):
 def test_ambiguous_goals_are_told(panda, self_model, camera, open_world):
     """With a slack threshold, the hand after half a turn matches too: both ends are named."""
     image = picture(panda, self_model, camera, Q_GOAL, level=2)
-    config = PlannerConfig().changed({"match.scale": 20.0, "polish.rounds": 1})
+    config = PlannerConfig().changed({"match.scale": 20.0})
     problem = make_problem(panda, ImageGoal(self_model, camera, image), Q_START, config)
     roots = np.stack([Q_START, Q_GOAL, HALF_TURNED])
     policy = VisualRRT.from_config(config, open_world)
