@@ -18,8 +18,9 @@ import numpy as np
 
 from vrrt_jax.config import PolishConfig
 from vrrt_jax.core.compiling import host_jit
+from vrrt_jax.core.edges import enforce_bounds
 from vrrt_jax.robots.kinematics import link_poses
-from vrrt_jax.scene.world import World
+from vrrt_jax.scene.world import World, batch_is_free
 from vrrt_jax.splat.camera import project
 from vrrt_jax.splat.images import cut_goal
 from vrrt_jax.splat.types import Camera, SplatModel
@@ -50,6 +51,11 @@ PROMISING = 6.0  # times the least cost; ends that cost more, and do not match, 
 RIVALS = 2.0  # times the least cost; ends that cost more on the fine image are left
 TWINNED = 2  # best ends whose kinematic twins, and half turns of the hand, are looked at
 SAME_END = 0.1  # [rad] half turns of a hand this near to an end are that end
+BESIDE = (
+    0.002,
+    0.03,
+)  # [rad] of a joint, how far beside an end in collision free ones are looked for
+NUM_BESIDE = 512  # configurations that are looked at there
 TURNS = 12  # in which the last joint goes all the way round
 TURNED = 3  # times as many ends of these turns as are kept
 LEAST_COVERED = 0.01  # share of a close-up; a hand that is hidden tells nothing
@@ -115,6 +121,7 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
         ends = _distinct_ends(world, _settled(world, fine, ends.q), config.kept)
     else:
         ends = _settled_with_hand(world, polishing, polishing.close_up, ends)
+    ends = _distinct_ends(world, _freed(world, fine, ends, seed), config.kept)
     judge = getattr(fine.goal, "judge", None)
     loss = ends.loss
     if judge is not None:
@@ -252,6 +259,28 @@ def _settled_together(
             column[rows[better]] = new[better]
         rows, ends = rows[pays], ends.take(pays)
     return done
+
+
+def _freed(world: World, fine: Objective, ends: Ends, seed: int) -> Ends:
+    """The same, but those in collision give way to free ones right beside them, if there are any.
+
+    A robot that touches something at its goal, such as one that grasps, is hardly ever seen so well
+    that its estimate touches nothing. Of free samples the one that costs least is taken, by the
+    parabola around the end.
+    """
+    rng, ends = np.random.default_rng(seed), Ends(*(np.array(column) for column in ends))
+    for row in np.flatnonzero(~ends.free):
+        scale = BESIDE[0] * (BESIDE[1] / BESIDE[0]) ** rng.uniform(size=(NUM_BESIDE, 1))
+        change = scale * rng.normal(size=(NUM_BESIDE, ends.q.shape[1]))
+        q = np.asarray(enforce_bounds(world, jnp.asarray(ends.q[row] + change, jnp.float32)))
+        more = np.einsum("ni,ij,nj->n", change, ends.matrix[row], change)
+        is_free = np.asarray(batch_is_free(world, q))
+        if np.any(is_free):
+            best = int(np.argmin(np.where(is_free, more, np.inf)))
+            ends.q[row], ends.free[row] = q[best], True
+            ends.cost[row] += more[best]
+            ends.loss[row] = evaluate_each(world, fine, q[best : best + 1])[0][0]
+    return ends
 
 
 def _hand_goal(
