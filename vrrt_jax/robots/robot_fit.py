@@ -22,7 +22,8 @@ from vrrt_jax.robots.self_collision_fit import fit_to_sample
 
 _CONFIGURATIONS = 40_000  # for self-collision
 _LEAF = 3e-4  # [m] size of the smallest triangle when the cover is proven
-_PROBE = 3  # spheres with which the bodies are compared
+_PROBES = (2, 8)  # spheres with which the bodies are compared
+_MOVES = 24  # of spheres of each body, to where they save more false alarms
 _SELF_SPACING = 0.05  # [m] of the longest side of a body, for each self-collision sphere
 _MOST_SELF = 12  # self-collision spheres of one body
 
@@ -149,14 +150,24 @@ def _share_out(
             f"num_spheres is {num_spheres}; expected at least one for each of the {len(samples)} "
             "moving bodies"
         )
-    # A few spheres tell how hard a body is to cover: twice as many leave about half the volume.
-    volume = {
-        body: _PROBE * sphere_fit.fit_body(own, _PROBE, rng)[2] for body, own in samples.items()
+    # Two numbers of spheres tell how the volume of a body's false alarms falls with their number:
+    # as a power of it, nearly.
+    few, more = (
+        {body: sphere_fit.fit_body(own, num, rng)[2] for body, own in samples.items()}
+        for num in _PROBES
+    )
+    growth = np.log(_PROBES[1] / _PROBES[0])
+    power = {
+        body: max(np.log((few[body] + 1e-9) / (more[body] + 1e-9)) / growth, 0.1) for body in few
     }
+
+    def volume(body: int, count: int) -> float:
+        return few[body] * (count / _PROBES[0]) ** -power[body]
+
     used = dict.fromkeys(samples, 1)
     while sum(used.values()) < num_spheres:
         saved = {
-            body: volume[body] / (count * (count + 1))
+            body: volume(body, count) - volume(body, count + 1)
             for body, count in used.items()
             if count < sphere_fit.MAX_SPHERES
         }
@@ -165,6 +176,6 @@ def _share_out(
         used[max(saved, key=lambda body: saved[body])] += 1
     fitted = {}
     for body, count in used.items():
-        fitted[body] = sphere_fit.fit_body(samples[body], count, rng)[:2]
+        fitted[body] = sphere_fit.fit_body(samples[body], count, rng, moves=_MOVES)[:2]
         progress(f"body {body}: {count} spheres")
     return fitted

@@ -12,6 +12,7 @@ from vrrt_jax.robots import (
     load_robot,
     mesh_sources,
     robot_fit,
+    sphere_descent,
     sphere_fit,
 )
 from vrrt_jax.robots.robot_spheres import spheres_of
@@ -111,7 +112,9 @@ def test_spheres_fitted_on_loading_contain_the_geometry(arm, rng):
 
 def test_fit_spheres_writes_a_robot(arm, tmp_path, monkeypatch, rng):
     monkeypatch.setattr(robot_fit, "_CONFIGURATIONS", 2000)
-    for name, value in (("_STARTS", 2), ("_STEPS", 60), ("_NUM_OUTSIDE", 600)):
+    monkeypatch.setattr(robot_fit, "_MOVES", 2)
+    monkeypatch.setattr(sphere_descent, "STEPS", 60)
+    for name, value in (("_STARTS", 2), ("_NUM_OUTSIDE", 600), ("_NUM_INSIDE", 1500)):
         monkeypatch.setattr(sphere_fit, name, value)
     lines = []
     xml = robot_fit.fit_spheres(arm, num_spheres=5, progress=lines.append)
