@@ -42,6 +42,11 @@ def add_robot_commands(commands: Any) -> None:
         "--into",
         help="an MJCF file that the command wrote: its joints and home stay, spheres are replaced",
     )
+    spheres.add_argument(
+        "--keep-self-collision",
+        action="store_true",
+        help="spheres checked against each other stay where they are; only their radii are fitted",
+    )
     spheres.add_argument("--seed", type=command.seed, default=0, help="of fit and measurement")
     spheres.add_argument(
         "--spheres",
@@ -101,7 +106,11 @@ def _spheres(arguments: argparse.Namespace) -> int:
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
     if arguments.out is not None:
         text = fit_spheres(
-            robot, num_spheres=arguments.spheres, seed=arguments.seed, progress=print
+            robot,
+            num_spheres=arguments.spheres,
+            keep_self_collision=arguments.keep_self_collision,
+            seed=arguments.seed,
+            progress=print,
         )
         if arguments.into is not None:
             text = replace_spheres(Path(arguments.into).read_text(), text)

@@ -1,5 +1,6 @@
 """Fit the collision spheres of a robot to its true geometry and write them as MJCF."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -12,13 +13,15 @@ from vrrt_jax.robots.geom_pieces import collision_pieces
 from vrrt_jax.robots.kinematics import BodySpheres
 from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 from vrrt_jax.robots.robot import Robot
+from vrrt_jax.robots.robot_spheres import spheres_of
 from vrrt_jax.robots.self_collision import (
     SelfCollisions,
     checked_pairs,
+    excluded,
     find_ignored_pairs,
     sample_self_collisions,
 )
-from vrrt_jax.robots.self_collision_fit import fit_to_sample
+from vrrt_jax.robots.self_collision_fit import fit_radii_to_sample, fit_to_sample
 
 _CONFIGURATIONS = 40_000  # for self-collision
 _LEAF = 3e-4  # [m] size of the smallest triangle when the cover is proven
@@ -32,6 +35,7 @@ def fit_spheres(
     robot: Robot,
     *,
     num_spheres: int = 44,
+    keep_self_collision: bool = False,
     seed: int = 0,
     progress: Callable[[str], None] = lambda line: None,
 ) -> str:
@@ -44,6 +48,8 @@ def fit_spheres(
     Args:
         robot: its kinematics and home are kept, its spheres are not used.
         num_spheres: collision spheres on all moving bodies together.
+        keep_self_collision: the robot's self-collision spheres stay where they are, with the pairs
+            of bodies that they ignore, and only their radii are fitted.
         seed: of all random choices.
         progress: called with a line of text now and then.
 
@@ -74,7 +80,8 @@ def fit_spheres(
     # Randomness of its own, so that another number of collision spheres changes nothing here.
     rng = np.random.default_rng([seed, 1])
     sample = sample_self_collisions(model, _CONFIGURATIONS, rng)
-    ignored_pairs = find_ignored_pairs(model, sample)
+    own = mujoco.MjModel.from_xml_string(robot.xml)
+    ignored_pairs = excluded(own) if keep_self_collision else find_ignored_pairs(model, sample)
     write = functools.partial(
         mjcf_writer.collision_mjcf,
         model,
@@ -86,7 +93,10 @@ def fit_spheres(
         comment=_comment(robot.name, num_spheres, seed),
     )
     write = functools.partial(write, ignored_pairs=ignored_pairs)
-    self_collision = _self_collision_spheres(model, samples, sample, write, rng)
+    if keep_self_collision:
+        self_collision = _refitted(model, own, sample, write)
+    else:
+        self_collision = _self_collision_spheres(model, samples, sample, write, rng)
     progress(f"{len(self_collision.body)} spheres take part in self-collision")
     return write(self_collision=self_collision)
 
@@ -103,7 +113,7 @@ def _self_collision_spheres(
     bodies = np.array(sorted(samples))
     dots = BodySpheres(body=bodies, center=np.zeros((len(bodies), 3)), radius=0.01 + 0.0 * bodies)
     draft = mujoco.MjModel.from_xml_string(write(self_collision=dots))
-    geoms = np.flatnonzero(draft.geom_group == int(mjcf_writer.SELF_COLLISION_GEOM["group"]))
+    geoms = np.flatnonzero(_is_self_collision(draft))
     checked = bodies[checked_pairs(draft, geoms)]
     # Covers to begin with; the fit shrinks them.
     covers = {}
@@ -115,9 +125,32 @@ def _self_collision_spheres(
         return BodySpheres(body=bodies[:0], center=np.zeros((0, 3)), radius=np.zeros(0))
     spheres = _collect(covers)
     pairs = checked_pairs(draft, geoms[np.searchsorted(bodies, spheres.body)])
-    pairs_of_bodies = {(min(pair), max(pair)) for pair in checked.tolist()}
-    truth = np.array([bool(touching & pairs_of_bodies) for touching in sample.touching])
-    return fit_to_sample(model, spheres, pairs, sample.q, truth)
+    return fit_to_sample(model, spheres, pairs, sample.q, _truth(sample, checked))
+
+
+def _refitted(
+    model: mujoco.MjModel,
+    own: mujoco.MjModel,
+    sample: SelfCollisions,
+    write: Callable[..., str],
+) -> BodySpheres:
+    """The self-collision spheres of a robot's own model, with other radii."""
+    kept = spheres_of(own).self_collision
+    body = np.array([model.body(own.body(k).name).id for k in kept.body])
+    kept = dataclasses.replace(kept, body=body)
+    draft = mujoco.MjModel.from_xml_string(write(self_collision=kept))
+    pairs = checked_pairs(draft, np.flatnonzero(_is_self_collision(draft)))
+    return fit_radii_to_sample(model, kept, pairs, sample.q, _truth(sample, body[pairs]))
+
+
+def _is_self_collision(model: mujoco.MjModel) -> np.ndarray:
+    return model.geom_group == int(mjcf_writer.SELF_COLLISION_GEOM["group"])
+
+
+def _truth(sample: SelfCollisions, pairs: np.ndarray) -> np.ndarray:
+    """Whether any of some pairs of bodies (P, 2) touches in each configuration, (m,) bool."""
+    checked = {(min(pair), max(pair)) for pair in pairs.tolist()}
+    return np.array([bool(touching & checked) for touching in sample.touching])
 
 
 def _comment(name: str, num_spheres: int, seed: int) -> str:

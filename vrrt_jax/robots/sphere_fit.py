@@ -22,6 +22,7 @@ from vrrt_jax.robots.sphere_descent import descend
 
 MAX_SPHERES = 32  # of one body
 _STARTS = 4
+_ROUNDS = 4  # at last, with the points that are hardest to contain
 _GENTLE = 0.5  # of the descent is left out after a move
 _OVERLAP = 1e-3  # [m] a point that is deeper in a second sphere needs no other one
 _SMALLER = 0.8  # of the radius of a sphere, each of the two that take its place
@@ -159,7 +160,8 @@ def fit_body(
         samples: of the body.
         num: number of spheres, at most ``MAX_SPHERES``.
         rng: source of randomness.
-        moves: how often one sphere moves to where it may save more; each takes a descent.
+        moves: how often one sphere moves to where it may save more; each takes a
+            descent. Without any the fit is quick, and coarser.
 
     Returns:
         Centers (num, 3) and radii (num,) [m], and the volume of false alarms [m^3].
@@ -172,6 +174,14 @@ def fit_body(
     for _ in range(moves if num > 1 else 0):
         begin = _moved(samples, *best[:2], rng)
         best = min(best, _fitted(samples, *begin, rng, _GENTLE), key=lambda found: found[2])
+    for _ in range(_ROUNDS if moves else 0):
+        # Half of the points to contain are now those that are nearest to being bare.
+        inside = samples.inside.copy()
+        half = len(inside) // 2
+        gap = _gaps(samples.surface, *best[:2]).min(axis=1)
+        inside[:half] = samples.surface[np.resize(np.argsort(-gap)[:half], half)]
+        closer = dataclasses.replace(samples, inside=inside)
+        best = min(best, _fitted(closer, *best[:2], rng, _GENTLE), key=lambda found: found[2])
     return best
 
 
