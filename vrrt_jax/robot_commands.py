@@ -43,15 +43,17 @@ def add_robot_commands(commands: Any) -> None:
         help="an MJCF file that the command wrote: its joints and home stay, spheres are replaced",
     )
     spheres.add_argument(
-        "--keep-self-collision",
-        action="store_true",
-        help="spheres checked against each other stay where they are; only their radii are fitted",
+        "--self-collision",
+        choices=("new", "radii", "kept"),
+        default="new",
+        help="spheres checked against each other: fit new ones, or the radii of those of the robot "
+        "alone, or keep them",
     )
     spheres.add_argument("--seed", type=command.seed, default=0, help="of fit and measurement")
     spheres.add_argument(
         "--spheres",
         type=command.whole(1, 200),
-        default=44,
+        default=64,
         help="collision spheres to fit, on all moving links together",
     )
     spheres.add_argument(
@@ -108,7 +110,7 @@ def _spheres(arguments: argparse.Namespace) -> int:
         text = fit_spheres(
             robot,
             num_spheres=arguments.spheres,
-            keep_self_collision=arguments.keep_self_collision,
+            self_collision=arguments.self_collision,
             seed=arguments.seed,
             progress=print,
         )

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -34,8 +35,8 @@ _MOST_SELF = 12  # self-collision spheres of one body
 def fit_spheres(
     robot: Robot,
     *,
-    num_spheres: int = 44,
-    keep_self_collision: bool = False,
+    num_spheres: int = 64,
+    self_collision: Literal["new", "radii", "kept"] = "new",
     seed: int = 0,
     progress: Callable[[str], None] = lambda line: None,
 ) -> str:
@@ -48,8 +49,8 @@ def fit_spheres(
     Args:
         robot: its kinematics and home are kept, its spheres are not used.
         num_spheres: collision spheres on all moving bodies together.
-        keep_self_collision: the robot's self-collision spheres stay where they are, with the pairs
-            of bodies that they ignore, and only their radii are fitted.
+        self_collision: fit new spheres for it; or only the radii of the robot's own; or keep these
+            as they are. The pairs of bodies to ignore are new with new spheres only.
         seed: of all random choices.
         progress: called with a line of text now and then.
 
@@ -81,7 +82,7 @@ def fit_spheres(
     rng = np.random.default_rng([seed, 1])
     sample = sample_self_collisions(model, _CONFIGURATIONS, rng)
     own = mujoco.MjModel.from_xml_string(robot.xml)
-    ignored_pairs = excluded(own) if keep_self_collision else find_ignored_pairs(model, sample)
+    ignored_pairs = find_ignored_pairs(model, sample) if self_collision == "new" else excluded(own)
     write = functools.partial(
         mjcf_writer.collision_mjcf,
         model,
@@ -93,12 +94,14 @@ def fit_spheres(
         comment=_comment(robot.name, num_spheres, seed),
     )
     write = functools.partial(write, ignored_pairs=ignored_pairs)
-    if keep_self_collision:
-        self_collision = _refitted(model, own, sample, write)
+    if self_collision == "new":
+        thin = _self_collision_spheres(model, samples, sample, write, rng)
     else:
-        self_collision = _self_collision_spheres(model, samples, sample, write, rng)
-    progress(f"{len(self_collision.body)} spheres take part in self-collision")
-    return write(self_collision=self_collision)
+        thin = _own_spheres(model, own)
+        if self_collision == "radii":
+            thin = _with_radii(model, thin, sample, write)
+    progress(f"{len(thin.body)} spheres take part in self-collision")
+    return write(self_collision=thin)
 
 
 def _self_collision_spheres(
@@ -128,19 +131,21 @@ def _self_collision_spheres(
     return fit_to_sample(model, spheres, pairs, sample.q, _truth(sample, checked))
 
 
-def _refitted(
-    model: mujoco.MjModel,
-    own: mujoco.MjModel,
-    sample: SelfCollisions,
-    write: Callable[..., str],
-) -> BodySpheres:
-    """The self-collision spheres of a robot's own model, with other radii."""
+def _own_spheres(model: mujoco.MjModel, own: mujoco.MjModel) -> BodySpheres:
+    """The self-collision spheres of a robot's own model, on the bodies of the one with meshes."""
     kept = spheres_of(own).self_collision
-    body = np.array([model.body(own.body(k).name).id for k in kept.body])
-    kept = dataclasses.replace(kept, body=body)
-    draft = mujoco.MjModel.from_xml_string(write(self_collision=kept))
+    body = np.array([model.body(own.body(k).name).id for k in kept.body], int)
+    return dataclasses.replace(kept, body=body)
+
+
+def _with_radii(
+    model: mujoco.MjModel, spheres: BodySpheres, sample: SelfCollisions, write: Callable[..., str]
+) -> BodySpheres:
+    """Self-collision spheres with the radii that agree best with a sample."""
+    draft = mujoco.MjModel.from_xml_string(write(self_collision=spheres))
     pairs = checked_pairs(draft, np.flatnonzero(_is_self_collision(draft)))
-    return fit_radii_to_sample(model, kept, pairs, sample.q, _truth(sample, body[pairs]))
+    truth = _truth(sample, spheres.body[pairs])
+    return fit_radii_to_sample(model, spheres, pairs, sample.q, truth)
 
 
 def _is_self_collision(model: mujoco.MjModel) -> np.ndarray:
