@@ -53,7 +53,8 @@ def descend(
     arrays = tuple(jnp.asarray(array, jnp.float32) for array in arrays)
     steps = jnp.arange(int(begin * STEPS), STEPS)
     found = _descend(num, jax.random.key(seed), steps / STEPS, *arrays)
-    return tuple(np.asarray(part, np.float64)[:num] for part in found)
+    better_center, better_radius = (np.asarray(part, np.float64)[:num] for part in found)
+    return better_center, better_radius
 
 
 @jax.jit
