@@ -42,11 +42,18 @@ def add_robot_commands(commands: Any) -> None:
         "--into",
         help="an MJCF file that the command wrote: its joints and home stay, spheres are replaced",
     )
+    spheres.add_argument(
+        "--self-collision",
+        choices=("new", "radii", "kept"),
+        default="new",
+        help="spheres checked against each other: fit new ones, or the radii of those of the robot "
+        "alone, or keep them",
+    )
     spheres.add_argument("--seed", type=command.seed, default=0, help="of fit and measurement")
     spheres.add_argument(
         "--spheres",
         type=command.whole(1, 200),
-        default=44,
+        default=64,
         help="collision spheres to fit, on all moving links together",
     )
     spheres.add_argument(
@@ -101,7 +108,11 @@ def _spheres(arguments: argparse.Namespace) -> int:
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
     if arguments.out is not None:
         text = fit_spheres(
-            robot, num_spheres=arguments.spheres, seed=arguments.seed, progress=print
+            robot,
+            num_spheres=arguments.spheres,
+            self_collision=arguments.self_collision,
+            seed=arguments.seed,
+            progress=print,
         )
         if arguments.into is not None:
             text = replace_spheres(Path(arguments.into).read_text(), text)

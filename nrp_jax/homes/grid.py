@@ -1,6 +1,7 @@
 """Occupancy grids: what is solid in a home, cell by cell."""
 
 import dataclasses
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -140,11 +141,18 @@ def load_map(path: str | Path, *, crop: tuple[float, float, float, float] | None
         raise ValueError(f"crop is {crop}; expected four numbers x0, y0, x1, y1 [m]")
     try:
         grid = readers[path.suffix](path, crop)
-        return grid if crop is None else grid.crop(crop[:2], crop[2:])
+        grid = grid if crop is None else grid.crop(crop[:2], crop[2:])
     except ValueError as error:
         raise ValueError(f"map '{path}': {error}") from error
     except MemoryError as error:
         raise ValueError(f"map '{path}': too little memory; read a part of it, see crop") from error
+    if np.all(grid.occupied):
+        warnings.warn(
+            f"map '{path}': all of its {grid.occupied.size} cells are solid; expected free ones: "
+            "an image may be 0 and 1 instead of 0 and 255, or need negate",
+            stacklevel=2,
+        )
+    return grid
 
 
 def coarsened(grid: Grid, resolution: float = RESOLUTION, *, cells: int | None = None) -> Grid:

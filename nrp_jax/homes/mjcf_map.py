@@ -19,6 +19,7 @@ _MEASURED = (
 )
 _HALF = RESOLUTION / 2 * (1 - 1e-3)  # of the inside of a cell [m]
 _THIN = 1e-4  # [m] the gap between the insides of two cells, where thinner geoms may be
+_MOST_CELLS = 2e7  # near geoms, each takes some microseconds
 _LEVEL = 1 - 1e-6  # least z of a floor's normal: rounded angles tilt it by a millimeter a meter
 
 
@@ -82,21 +83,48 @@ def read_mjcf_map(path: Path, crop: tuple[float, float, float, float] | None) ->
     if (shape < 1).any():
         raise ValueError(f"nothing of it lies between {low[:2].tolist()} and {high[:2].tolist()}")
     check_memory(30.0 * shape.prod(), f"a map of {shape[0]} x {shape[1]} x {shape[2]} cells")
+    _check_work(boxes, first, shape)
     occupied = np.zeros(shape, bool)
     for geom in walls:
         occupied |= _behind(data, geom, first, shape)
     _fill(model, data, probe.id, zip(geoms.tolist(), boxes, strict=True), first, occupied)
+    if boxes and crop is None and not occupied.any():
+        raise ValueError(
+            f"nothing of it is solid from its floor up to {HEIGHT:g} m above, and the floor is the "
+            "highest level plane that faces up: make a ceiling of boxes"
+        )
     return Grid(occupied=occupied, origin=tuple((first * RESOLUTION).tolist()))
+
+
+def _cells_near(
+    bounds: tuple[np.ndarray, np.ndarray], first: np.ndarray, shape: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The cells (3,) to (3,) of a map, the last one left out, that bounds [m] reach."""
+    lower, upper = bounds
+    start = np.clip(np.floor(lower / RESOLUTION + 1e-6).astype(int) - first, 0, shape)
+    stop = np.clip(np.ceil(upper / RESOLUTION - 1e-6).astype(int) - first, 0, shape)
+    return start, np.maximum(stop, start)
+
+
+def _check_work(boxes: list, first: np.ndarray, shape: np.ndarray) -> None:
+    """Raise a ValueError if so many cells are near geoms that it would take hours."""
+    ranges = [_cells_near(box, first, shape) for box in boxes]
+    num = sum(float(np.prod(stop - start, dtype=float)) for start, stop in ranges)
+    if num > _MOST_CELLS:
+        raise ValueError(
+            f"{num:.2g} cells of {RESOLUTION:g} m are near its geoms, in a map of {shape[0]} x "
+            f"{shape[1]} cells; expected at most {_MOST_CELLS:.0e}: give lengths in meters, or "
+            "read a part of it, see crop"
+        )
 
 
 def _fill(model, data, probe: int, geoms, first: np.ndarray, occupied: np.ndarray) -> None:
     """Mark the cells that geoms with their bounds touch: a box is moved to each cell near them."""
     data.geom_xmat[probe] = np.eye(3).ravel()
-    shape = occupied.shape
-    for geom, (lower, upper) in geoms:
-        start = np.clip(np.floor(lower / RESOLUTION + 1e-6).astype(int) - first, 0, shape)
-        stop = np.clip(np.ceil(upper / RESOLUTION - 1e-6).astype(int) - first, 0, shape)
-        for index in np.ndindex(*np.maximum(stop - start, 0)):
+    shape = np.array(occupied.shape)
+    for geom, bounds in geoms:
+        start, stop = _cells_near(bounds, first, shape)
+        for index in np.ndindex(*(stop - start)):
             cell = start + index
             data.geom_xpos[probe] = (first + cell + 0.5) * RESOLUTION
             if mujoco.mj_geomDistance(model, data, probe, geom, RESOLUTION, None) <= 0:

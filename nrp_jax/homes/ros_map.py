@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from PIL import Image, UnidentifiedImageError
 
 from nrp_jax.homes.grid import Grid, coarsened, part_of
 from nrp_jax.homes.memory import check_memory
+from vrrt_jax.core.data_file import read_yaml
 
 _MODES = ("trinary", "scale", "raw")
+_FIELDS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
 _UNKNOWN = 205  # gray that map savers write for unknown
 _STRIP = 1 << 22  # pixels converted at a time
 _WORDS = {False: ("0", "n", "no", "false", "off"), True: ("1", "y", "yes", "true", "on")}
@@ -61,14 +62,20 @@ def read_ros_map(path: Path, crop: tuple[float, float, float, float] | None) -> 
 def _read_about(path: Path) -> _About:
     """The fields of the YAML file, each checked."""
     try:
-        about = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        about = read_yaml(path)
+    except ValueError as error:
         raise ValueError(f"it is not a YAML file: {' '.join(str(error).split())}") from error
     wanted = ("image", "resolution", "origin")
     if not isinstance(about, dict) or any(name not in about for name in wanted):
         have = ", ".join(map(str, about)) if isinstance(about, dict) else type(about).__name__
         raise ValueError(
             f"it is not a map_server file with image, resolution and origin; it has: {have}"
+        )
+    if unused := [str(name) for name in about if name not in _FIELDS]:
+        warnings.warn(
+            f"the fields {', '.join(unused)} of '{path.name}' are not used; known ones: "
+            f"{', '.join(_FIELDS)}",
+            stacklevel=4,
         )
     if not isinstance(about["image"], str) or not about["image"].strip():
         raise ValueError(f"its image is {about['image']!r}; expected the name of a file")

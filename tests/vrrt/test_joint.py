@@ -11,7 +11,7 @@ import vrrt_jax
 import vrrt_jax.joint
 from vrrt_jax import ConfigurationGoal, Obstacle, PlannerConfig, Status
 from vrrt_jax.scene.verify import interpolate
-from vrrt_jax.scene.world import keeping_clearance
+from vrrt_jax.scene.world import keeping_clearance, with_margin
 
 KEY = jax.random.key(0)
 
@@ -54,10 +54,15 @@ def test_less_is_kept_where_an_end_is_nearer(panda, wall_world):
 def test_the_margin_that_is_kept_is_the_widest_that_ends_allow(wall_world):
     ends = np.stack([START, GOAL])
     clear = float(np.min([vrrt_jax.obstacle_clearance(wall_world, q) for q in ends]))
-    fits = keeping_clearance(wall_world, ends, 0.9 * clear)
-    np.testing.assert_allclose(fits.margin, 0.9 * clear, rtol=1e-5)
+    fits = keeping_clearance(wall_world, ends, 0.4 * clear)  # links of the arm are nearer
+    np.testing.assert_allclose(fits.margin, 0.4 * clear, rtol=1e-5)
+    # What does not fit is halved until it does, between links too.
     half = keeping_clearance(wall_world, ends, 1.5 * clear)
-    np.testing.assert_allclose(half.margin, 0.75 * clear, rtol=1e-5)
+    halvings = np.log2(1.5 * clear / float(half.margin))
+    np.testing.assert_allclose(halvings, max(round(halvings), 1), atol=1e-4)
+    wider = with_margin(wall_world, 2 * half.margin)
+    assert all(vrrt_jax.is_free(half, q) for q in ends)
+    assert not all(vrrt_jax.is_free(wider, q) for q in ends)
     assert keeping_clearance(wall_world, ends, 0.0) is wall_world
     blocked = (START + GOAL)[None] / 2
     assert keeping_clearance(wall_world, blocked, 0.01) is wall_world

@@ -113,6 +113,7 @@ def _plain(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     # Only kinematics is used; a URDF link without <inertial> would not compile.
     for body in spec.bodies[1:]:
         body.explicitinertial = True
+        body.mocap = False  # nothing moves it here: it stands where the file puts it
         body.mass = 1.0
         body.fullinertia = [np.nan] * 6
         body.inertia = [0.01] * 3

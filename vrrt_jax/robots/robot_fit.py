@@ -1,7 +1,9 @@
 """Fit the collision spheres of a robot to its true geometry and write them as MJCF."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -12,17 +14,20 @@ from vrrt_jax.robots.geom_pieces import collision_pieces
 from vrrt_jax.robots.kinematics import BodySpheres
 from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 from vrrt_jax.robots.robot import Robot
+from vrrt_jax.robots.robot_spheres import spheres_of
 from vrrt_jax.robots.self_collision import (
     SelfCollisions,
     checked_pairs,
+    excluded,
     find_ignored_pairs,
     sample_self_collisions,
 )
-from vrrt_jax.robots.self_collision_fit import fit_to_sample
+from vrrt_jax.robots.self_collision_fit import fit_radii_to_sample, fit_to_sample
 
 _CONFIGURATIONS = 40_000  # for self-collision
 _LEAF = 3e-4  # [m] size of the smallest triangle when the cover is proven
-_PROBE = 3  # spheres with which the bodies are compared
+_PROBES = (2, 8)  # spheres with which the bodies are compared
+_MOVES = 24  # of spheres of each body, to where they save more false alarms
 _SELF_SPACING = 0.05  # [m] of the longest side of a body, for each self-collision sphere
 _MOST_SELF = 12  # self-collision spheres of one body
 
@@ -30,7 +35,8 @@ _MOST_SELF = 12  # self-collision spheres of one body
 def fit_spheres(
     robot: Robot,
     *,
-    num_spheres: int = 44,
+    num_spheres: int = 64,
+    self_collision: Literal["new", "radii", "kept"] = "new",
     seed: int = 0,
     progress: Callable[[str], None] = lambda line: None,
 ) -> str:
@@ -43,6 +49,8 @@ def fit_spheres(
     Args:
         robot: its kinematics and home are kept, its spheres are not used.
         num_spheres: collision spheres on all moving bodies together.
+        self_collision: fit new spheres for it; or only the radii of the robot's own; or keep these
+            as they are. The pairs of bodies to ignore are new with new spheres only.
         seed: of all random choices.
         progress: called with a line of text now and then.
 
@@ -73,7 +81,8 @@ def fit_spheres(
     # Randomness of its own, so that another number of collision spheres changes nothing here.
     rng = np.random.default_rng([seed, 1])
     sample = sample_self_collisions(model, _CONFIGURATIONS, rng)
-    ignored_pairs = find_ignored_pairs(model, sample)
+    own = mujoco.MjModel.from_xml_string(robot.xml)
+    ignored_pairs = find_ignored_pairs(model, sample) if self_collision == "new" else excluded(own)
     write = functools.partial(
         mjcf_writer.collision_mjcf,
         model,
@@ -85,9 +94,14 @@ def fit_spheres(
         comment=_comment(robot.name, num_spheres, seed),
     )
     write = functools.partial(write, ignored_pairs=ignored_pairs)
-    self_collision = _self_collision_spheres(model, samples, sample, write, rng)
-    progress(f"{len(self_collision.body)} spheres take part in self-collision")
-    return write(self_collision=self_collision)
+    if self_collision == "new":
+        thin = _self_collision_spheres(model, samples, sample, write, rng)
+    else:
+        thin = _own_spheres(model, own)
+        if self_collision == "radii":
+            thin = _with_radii(model, thin, sample, write)
+    progress(f"{len(thin.body)} spheres take part in self-collision")
+    return write(self_collision=thin)
 
 
 def _self_collision_spheres(
@@ -102,7 +116,7 @@ def _self_collision_spheres(
     bodies = np.array(sorted(samples))
     dots = BodySpheres(body=bodies, center=np.zeros((len(bodies), 3)), radius=0.01 + 0.0 * bodies)
     draft = mujoco.MjModel.from_xml_string(write(self_collision=dots))
-    geoms = np.flatnonzero(draft.geom_group == int(mjcf_writer.SELF_COLLISION_GEOM["group"]))
+    geoms = np.flatnonzero(_is_self_collision(draft))
     checked = bodies[checked_pairs(draft, geoms)]
     # Covers to begin with; the fit shrinks them.
     covers = {}
@@ -114,9 +128,34 @@ def _self_collision_spheres(
         return BodySpheres(body=bodies[:0], center=np.zeros((0, 3)), radius=np.zeros(0))
     spheres = _collect(covers)
     pairs = checked_pairs(draft, geoms[np.searchsorted(bodies, spheres.body)])
-    pairs_of_bodies = {(min(pair), max(pair)) for pair in checked.tolist()}
-    truth = np.array([bool(touching & pairs_of_bodies) for touching in sample.touching])
-    return fit_to_sample(model, spheres, pairs, sample.q, truth)
+    return fit_to_sample(model, spheres, pairs, sample.q, _truth(sample, checked))
+
+
+def _own_spheres(model: mujoco.MjModel, own: mujoco.MjModel) -> BodySpheres:
+    """The self-collision spheres of a robot's own model, on the bodies of the one with meshes."""
+    kept = spheres_of(own).self_collision
+    body = np.array([model.body(own.body(k).name).id for k in kept.body], int)
+    return dataclasses.replace(kept, body=body)
+
+
+def _with_radii(
+    model: mujoco.MjModel, spheres: BodySpheres, sample: SelfCollisions, write: Callable[..., str]
+) -> BodySpheres:
+    """Self-collision spheres with the radii that agree best with a sample."""
+    draft = mujoco.MjModel.from_xml_string(write(self_collision=spheres))
+    pairs = checked_pairs(draft, np.flatnonzero(_is_self_collision(draft)))
+    truth = _truth(sample, spheres.body[pairs])
+    return fit_radii_to_sample(model, spheres, pairs, sample.q, truth)
+
+
+def _is_self_collision(model: mujoco.MjModel) -> np.ndarray:
+    return model.geom_group == int(mjcf_writer.SELF_COLLISION_GEOM["group"])
+
+
+def _truth(sample: SelfCollisions, pairs: np.ndarray) -> np.ndarray:
+    """Whether any of some pairs of bodies (P, 2) touches in each configuration, (m,) bool."""
+    checked = {(min(pair), max(pair)) for pair in pairs.tolist()}
+    return np.array([bool(touching & checked) for touching in sample.touching])
 
 
 def _comment(name: str, num_spheres: int, seed: int) -> str:
@@ -149,14 +188,24 @@ def _share_out(
             f"num_spheres is {num_spheres}; expected at least one for each of the {len(samples)} "
             "moving bodies"
         )
-    # A few spheres tell how hard a body is to cover: twice as many leave about half the volume.
-    volume = {
-        body: _PROBE * sphere_fit.fit_body(own, _PROBE, rng)[2] for body, own in samples.items()
+    # Two numbers of spheres tell how the volume of a body's false alarms falls with their number:
+    # as a power of it, nearly.
+    few, more = (
+        {body: sphere_fit.fit_body(own, num, rng)[2] for body, own in samples.items()}
+        for num in _PROBES
+    )
+    growth = np.log(_PROBES[1] / _PROBES[0])
+    power = {
+        body: max(np.log((few[body] + 1e-9) / (more[body] + 1e-9)) / growth, 0.1) for body in few
     }
+
+    def volume(body: int, count: int) -> float:
+        return few[body] * (count / _PROBES[0]) ** -power[body]
+
     used = dict.fromkeys(samples, 1)
     while sum(used.values()) < num_spheres:
         saved = {
-            body: volume[body] / (count * (count + 1))
+            body: volume(body, count) - volume(body, count + 1)
             for body, count in used.items()
             if count < sphere_fit.MAX_SPHERES
         }
@@ -165,6 +214,6 @@ def _share_out(
         used[max(saved, key=lambda body: saved[body])] += 1
     fitted = {}
     for body, count in used.items():
-        fitted[body] = sphere_fit.fit_body(samples[body], count, rng)[:2]
+        fitted[body] = sphere_fit.fit_body(samples[body], count, rng, moves=_MOVES)[:2]
         progress(f"body {body}: {count} spheres")
     return fitted

@@ -5,31 +5,31 @@ The command ``vrrt spheres`` fits with it. Robots are loaded with the quick cove
 
 The spheres of a body minimize the volume of false alarms: places for the center of a ball-shaped
 obstacle that touches a sphere but not the robot. Places around the base, where hardly an obstacle
-stands, count little. The spheres are found by gradient descent from several
-starts, with a penalty on surface left uncovered, and grown at last until nothing is.
+stands, count little. The spheres are found by gradient descent from several starts, with the
+surface as a constraint (:mod:`vrrt_jax.robots.sphere_descent`), and grown over what is left bare.
+A descent keeps spheres where they began, so that then one at a time moves to where it saves more.
 """
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
-import optax
 from scipy.spatial import KDTree
 
 from vrrt_jax.robots.convex_parts import Piece, grow, surface_samples, union_depth
 from vrrt_jax.robots.limits import joint_ranges
+from vrrt_jax.robots.sphere_descent import descend
 
-MAX_SPHERES = 16  # of one body
-_STARTS = 3
-_STEPS = 250
-_ROUNDS = 2  # of going on from the best start, with the points that it left bare
-_GENTLE = 0.5  # of the descent is left out then
+MAX_SPHERES = 32  # of one body
+_STARTS = 4
+_ROUNDS = 4  # at last, with the points that are hardest to contain
+_GENTLE = 0.5  # of the descent is left out after a move
+_OVERLAP = 1e-3  # [m] a point that is deeper in a second sphere needs no other one
+_SMALLER = 0.8  # of the radius of a sphere, each of the two that take its place
 _SPACING = 0.003  # [m] between surface samples
 _BALLS = (0.04, 0.1)  # [m] radii of the obstacles that false alarms are counted for
 _SHELL = 0.045  # [m] how far from touching they are counted
-_NUM_OUTSIDE, _NUM_INSIDE, _NUM_INTERIOR = 2500, 1500, 200
+_NUM_OUTSIDE, _NUM_INSIDE, _NUM_INTERIOR = 5000, 8000, 400
 _AROUND_BASE = 0.25  # of the reach: obstacles stand farther from the base's axis
 _MIN_SHARE = 0.1  # of the places around a body that count, even if all are around the base
 
@@ -63,7 +63,9 @@ def sample_bodies(
         # To be covered: mostly surface, and some of the interior, so that nothing fits inside.
         interior = _box_points(surfaces[body], 0.0, 20 * _NUM_INTERIOR, rng)
         interior = interior[union_depth(own, interior) > 0][:_NUM_INTERIOR]
-        surface = rng.permutation(surfaces[body])[: _NUM_INSIDE - len(interior)]
+        # As many points of every body, so that one compiled descent serves all.
+        num, whole = _NUM_INSIDE - len(interior), surfaces[body]
+        surface = whole[rng.choice(len(whole), num, replace=len(whole) < num)]
         outside, ball, cell = _outside(model, body, own, surfaces, trees, rng)
         share = max(_share_of_obstacles(model, body, outside, rng), _MIN_SHARE)
         samples[body] = BodySamples(
@@ -150,7 +152,7 @@ def _clear_of_others(
 
 
 def fit_body(
-    samples: BodySamples, num: int, rng: np.random.Generator
+    samples: BodySamples, num: int, rng: np.random.Generator, *, moves: int = 0
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """The best found spheres that cover a body's samples.
 
@@ -158,6 +160,8 @@ def fit_body(
         samples: of the body.
         num: number of spheres, at most ``MAX_SPHERES``.
         rng: source of randomness.
+        moves: how often one sphere moves to where it may save more; each takes a
+            descent. Without any the fit is quick, and coarser.
 
     Returns:
         Centers (num, 3) and radii (num,) [m], and the volume of false alarms [m^3].
@@ -165,56 +169,64 @@ def fit_body(
     # Clusters of the interior are slices along a long body, those of the surface are patches.
     whole, interior = samples.inside, samples.inside[samples.num_surface :]
     sources = [interior if k % 2 == 0 and len(interior) else whole for k in range(_STARTS)]
-    starts = [_start(source, whole, num, rng) for source in sources]
-    centers, radii = (np.array(part) for part in zip(*starts, strict=True))
-    fitted = _descended(samples, centers, radii)
-    # Of all starts keep the one with the least false alarms, once every sample is covered.
-    best = min((_covering(samples, *spheres) for spheres in fitted), key=lambda found: found[2])
-    for _ in range(_ROUNDS):
-        # Half of the points to cover are now those that would have to be taken in by growing.
-        center, radius = best[3]
-        gap = _gaps(samples.surface, center, radius)
-        hard = np.argsort(-gap)[: max(int(np.sum(gap > 0)), 1)]
+    fitted = [_fitted(samples, *_start(source, whole, num, rng), rng) for source in sources]
+    best = min(fitted, key=lambda found: found[2])
+    for _ in range(moves if num > 1 else 0):
+        begin = _moved(samples, *best[:2], rng)
+        best = min(best, _fitted(samples, *begin, rng, _GENTLE), key=lambda found: found[2])
+    for _ in range(_ROUNDS if moves else 0):
+        # Half of the points to contain are now those that are nearest to being bare.
         inside = samples.inside.copy()
-        change = rng.choice(len(inside), len(inside) // 2, replace=False)
-        inside[change] = samples.surface[rng.choice(hard, len(change))]
-        changed = dataclasses.replace(samples, inside=inside)
-        ((center, radius),) = _descended(changed, center[None], radius[None], begin=_GENTLE)
-        best = min(best, _covering(samples, center, radius), key=lambda found: found[2])
-    return best[:3]
+        half = len(inside) // 2
+        gap = _gaps(samples.surface, *best[:2]).min(axis=1)
+        inside[:half] = samples.surface[np.resize(np.argsort(-gap)[:half], half)]
+        closer = dataclasses.replace(samples, inside=inside)
+        best = min(best, _fitted(closer, *best[:2], rng, _GENTLE), key=lambda found: found[2])
+    return best
+
+
+def _fitted(
+    samples: BodySamples,
+    center: np.ndarray,
+    radius: np.ndarray,
+    rng: np.random.Generator,
+    begin: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Spheres after a descent, grown over the surface, and their volume of false alarms [m^3]."""
+    obstacles, seed = (samples.outside, samples.ball), int(rng.integers(1 << 31))
+    center, radius = descend(center, radius, obstacles, samples.inside, seed=seed, begin=begin)
+    radius = grow(np.linalg.norm(samples.surface[:, None] - center, axis=-1), radius)
+    is_alarm = _gaps(samples.outside, center, radius).min(axis=1) < samples.ball
+    return center, radius, float(np.sum(is_alarm) * samples.cell)
+
+
+def _moved(
+    samples: BodySamples, center: np.ndarray, radius: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same spheres, but one that others could stand in for halves the work of a bad one."""
+    gaps = _gaps(samples.outside, center, radius)
+    alarms = np.bincount(
+        gaps.argmin(axis=1)[gaps.min(axis=1) < samples.ball], minlength=len(radius)
+    )
+    bad = rng.choice(len(radius), p=(alarms + 1.0) / np.sum(alarms + 1.0))
+    # Points that no other sphere holds.
+    gaps = _gaps(samples.surface, center, radius)
+    is_own = np.partition(gaps, 1, axis=1)[:, 1] > -_OVERLAP
+    own = np.bincount(gaps.argmin(axis=1)[is_own], minlength=len(radius))
+    weight = 1.0 / (own + 1.0)
+    weight[bad] = 0.0
+    idle = rng.choice(len(radius), p=weight / weight.sum())
+    direction = rng.normal(size=3)
+    shift = radius[bad] / 2 * direction / np.linalg.norm(direction)
+    center, radius = center.copy(), radius.copy()
+    center[[bad, idle]] = center[bad] - shift, center[bad] + shift
+    radius[[bad, idle]] = _SMALLER * radius[bad]
+    return center, radius
 
 
 def _gaps(points: np.ndarray, center: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Distances (p,) of points (p, 3) from the nearest sphere [m]."""
-    return (np.linalg.norm(points[:, None] - center, axis=-1) - radius).min(axis=1)
-
-
-def _covering(
-    samples: BodySamples, center: np.ndarray, radius: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float, tuple[np.ndarray, np.ndarray]]:
-    """Spheres grown over the surface, their volume of false alarms [m^3], and those before."""
-    grown = grow(np.linalg.norm(samples.surface[:, None] - center, axis=-1), radius)
-    is_alarm = _gaps(samples.outside, center, grown) < samples.ball
-    return center, grown, float(np.sum(is_alarm) * samples.cell), (center, radius)
-
-
-def _descended(
-    samples: BodySamples, center: np.ndarray, radius: np.ndarray, begin: float = 0.0
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Improve spheres, (starts, num, 3) and (starts, num), from a share of the descent on."""
-    # One compiled descent serves up to four numbers of spheres: the spare ones have no effect.
-    num = radius.shape[1]
-    spare = ((0, 0), (0, -num % 4))
-    arrays = (
-        np.pad(center, (*spare, (0, 0))),
-        np.pad(radius, spare, constant_values=-1.0),
-        samples.outside,
-        samples.ball,
-        samples.inside,
-    )
-    found = _descend(num, begin, *(jnp.asarray(a, jnp.float32) for a in arrays))
-    centers, radii = (np.asarray(part, np.float64)[:, :num] for part in found)
-    return list(zip(centers, radii, strict=True))
+    """Distances (p, n) of points (p, 3) from spheres [m]; negative inside."""
+    return np.linalg.norm(points[:, None] - center, axis=-1) - radius
 
 
 def _start(
@@ -232,49 +244,3 @@ def _start(
     nearest = distance.argmin(1)
     radii = [distance[nearest == k, k].max(initial=0.02) for k in range(num)]
     return centers, np.array(radii)
-
-
-@jax.jit
-def _descend(
-    num: jax.Array,
-    begin: jax.Array,
-    centers: jax.Array,
-    radii: jax.Array,
-    outside: jax.Array,
-    ball: jax.Array,
-    inside: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """Improve (starts, spheres, 3) centers and (starts, spheres) radii by Adam.
-
-    ``begin`` is the share of the descent that is left out: then it begins sharp, in small steps.
-    """
-    used = jnp.arange(radii.shape[1]) < num
-    optimizer = optax.adam(optax.cosine_decay_schedule(2e-3, _STEPS, 0.02))
-
-    def distance(spheres, points):
-        center, radius = spheres
-        # A center may be one of the points: the derivative of a norm is not a number there.
-        squared = jnp.sum((points[:, None] - center) ** 2, axis=-1)
-        gap = jnp.sqrt(squared + 1e-12) - radius
-        return jnp.min(jnp.where(used, gap, jnp.inf), axis=-1)
-
-    def loss(spheres, progress):
-        # Soft counts of false alarms, which get sharper, and a penalty on bare points, which grows.
-        width = 0.006 * (1 - progress) + 0.0015 * progress
-        alarms = jnp.mean(jax.nn.sigmoid((ball - distance(spheres, outside)) / width))
-        bare = jax.nn.relu(distance(spheres, inside) + 3e-4) / 5e-3
-        return alarms + (0.3 + 3 * progress) * (jnp.mean(bare**2) + 0.002 * jnp.max(bare) ** 2)
-
-    def step(carry, progress):
-        spheres, state = carry
-        updates, state = optimizer.update(jax.grad(loss)(spheres, progress), state)
-        moved = jax.tree.map(lambda x, change: x + (1 - begin) * change, spheres, updates)
-        return (moved, state), None
-
-    def descend(center, radius):
-        carry = ((center, radius), optimizer.init((center, radius)))
-        progress = begin + (1 - begin) * jnp.arange(_STEPS) / _STEPS
-        (spheres, _), _ = jax.lax.scan(step, carry, progress)
-        return spheres
-
-    return jax.vmap(descend)(centers, radii)

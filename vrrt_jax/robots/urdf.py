@@ -51,6 +51,7 @@ def urdf_spec(root: ElementTree.Element, path: Path, *, visuals: bool) -> mujoco
     Raises:
         ValueError: MuJoCo cannot read it, or a mesh that is used is nowhere.
     """
+    _check_tree(root)
     compiler = root
     for tag in ("mujoco", "compiler"):
         found = compiler.find(tag)
@@ -89,6 +90,22 @@ def urdf_spec(root: ElementTree.Element, path: Path, *, visuals: bool) -> mujoco
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
     spec.modelfiledir = str(folder)
     return spec
+
+
+def _check_tree(root: ElementTree.Element) -> None:
+    """Raise a ValueError if names are there twice, or links hang on nothing: MuJoCo takes both."""
+    for kind in ("link", "joint"):
+        names = [element.get("name", "") for element in root.findall(kind)]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two {kind}s are named {', '.join(twice)}; give each its own name")
+    parts = [joint.find("child") for joint in root.findall("joint")]
+    children = {part.get("link") for part in parts if part is not None}
+    roots = [name for link in root.findall("link") if (name := link.get("name")) not in children]
+    if len(roots) > 1:
+        raise ValueError(
+            f"the links {', '.join(map(str, roots))} are children of no joint; expected one such "
+            "link, the base: add the joints that carry the others"
+        )
 
 
 def _meshes(root: ElementTree.Element) -> Iterator[tuple[str, str, ElementTree.Element]]:

@@ -16,6 +16,8 @@ from vrrt_jax.splat.picture_file import read_image
 from vrrt_jax.splat.pixels import unit_pixels, valid_mask
 from vrrt_jax.splat.types import Camera
 
+_MOST_OF_RIM = 0.75  # white in a robot's mask; more is an inverted one
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Photo:
@@ -97,6 +99,7 @@ def _with_mask(pixels: np.ndarray, robot_mask: Any, background: Any, box: Any) -
     height, width = rgb.shape[:2]
     if robot_mask is not None:
         alpha = valid_mask(_picture_of_mask(robot_mask), height, width, "the robot's mask")
+        _check_not_inverted(alpha)
     elif background is not None:
         alpha = robot_before_background(rgb, _picture(background, "the background"))
     else:
@@ -106,10 +109,25 @@ def _with_mask(pixels: np.ndarray, robot_mask: Any, background: Any, box: Any) -
 
 def _picture_of_mask(mask: Any) -> np.ndarray:
     """A mask as it is given, or the colors of its file; not empty."""
-    picture = read_image(mask) if isinstance(mask, str | Path) else np.asarray(mask)
+    picture = np.asarray(mask)
+    if isinstance(mask, str | Path):
+        picture = read_image(mask)
+        # Programs that label pictures write 0 and 1 of 255.
+        if picture.max() == np.float32(1 / 255):
+            picture = picture * np.float32(255)
     if not picture[..., :3].any() or (picture.ndim == 3 and picture.shape[2] == 4):
         raise ValueError(
             "the robot's mask is all black, or has transparency; expected a picture that is white "
             "on the robot and black elsewhere"
         )
     return picture
+
+
+def _check_not_inverted(alpha: np.ndarray) -> None:
+    """Raise a ValueError if a mask (H, W) is 1 nearly all around its rim, where no robot is."""
+    rim = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
+    if rim.mean() > _MOST_OF_RIM:
+        raise ValueError(
+            f"the robot's mask is white on {100 * rim.mean():.0f} % of the image's rim; expected "
+            "white on the robot and black elsewhere: invert it"
+        )

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 import nrp_jax
-from nrp_jax.homes import memory
+from nrp_jax.homes import memory, mjcf_map
 from nrp_jax.homes.grid import coarsened, load_map
 
 ROS = "image: home.png\nresolution: 0.1\norigin: [-1.0, -2.0, 0.0]\n"
@@ -164,12 +164,29 @@ def test_thresholds_are_those_of_the_file(tmp_path):
         ("image", "negate: 3\nimage", "negate is 3; expected 0 or 1"),
         ("image", "free_thresh: 65\nimage", "free_thresh is 65.0; expected a share"),
         ("image", "{image", "not a YAML file"),
+        ("image", "negate: 0\nnegate: 1\nimage", "the field 'negate' is there twice"),
     ],
 )
 def test_malformed_ros_maps(tmp_path, old, new, message):
     assert old in ROS
     with pytest.raises(ValueError, match=message):
         ros(tmp_path, [[254]], base=ROS.replace(old, new, 1))
+
+
+def test_what_a_ros_map_says_in_vain_is_told(tmp_path):
+    with pytest.warns(UserWarning, match="the fields negat of 'home.yaml' are not used"):
+        assert ros(tmp_path, [[254, 0]], "negat: 1\n").tolist() == [[True, False]]
+    with pytest.warns(UserWarning, match="all of its 2 cells are solid"):
+        ros(tmp_path, [[1, 0]])
+
+
+def test_scenes_that_cannot_be_meant_so_are_refused(tmp_path, monkeypatch):
+    floor, box = '<geom type="plane" size="3 3 1"/>', '<geom type="box" size="1 1 1" pos="0 2 1"/>'
+    with pytest.raises(ValueError, match="nothing of it is solid from its floor up to 2 m above"):
+        scene(tmp_path, floor + box + floor.replace("plane", 'plane" pos="0 0 3'))
+    monkeypatch.setattr(mjcf_map, "_MOST_CELLS", 7999.0)
+    with pytest.raises(ValueError, match=r"8e\+03 cells of 0.1 m .* give lengths in meters"):
+        scene(tmp_path, floor + box)
 
 
 def test_a_deep_image_is_refused(tmp_path):

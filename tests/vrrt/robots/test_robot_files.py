@@ -113,6 +113,28 @@ def test_limits_of_many_turns_may_be_in_degrees(tmp_path):
         load_robot(urdf(tmp_path, limit='<limit lower="-12.6" upper="12.6"/>'))
 
 
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ('<link name="loose"/>', "loose are children of no joint; expected one such link"),
+        ('<link name="l"/><link name="l"/>', "two links are named l"),
+        ('<joint name="j" type="fixed"/><joint name="j" type="fixed"/>', "two joints are named j"),
+    ],
+)
+def test_a_urdf_is_one_tree_with_names_of_their_own(tmp_path, more, words):
+    text = urdf(tmp_path).read_text().replace("</robot>", more + "</robot>")
+    with pytest.raises(ValueError, match=words):
+        load_robot(write(tmp_path, text, "other.urdf"))
+
+
+def test_a_body_for_motion_capture_is_no_moving_link(tmp_path):
+    text = """<mujoco><worldbody><body name="base"><geom size=".1"/><body name="arm" pos="0 0 .3">
+    <joint axis="0 1 0" range="-90 90"/><geom size=".05"/></body></body>
+    <body name="target" mocap="true" pos="1 0 0"><geom size=".2"/></body></worldbody></mujoco>"""
+    robot = load_robot(write(tmp_path, text, "mocap.xml"))
+    assert set(robot.collision_sphere_bodies) == {"arm"}
+
+
 def test_what_is_no_urdf_yet_is_refused(tmp_path):
     for site in ("www.ros.org/wiki", "wiki.ros.org"):
         spaced = f'<robot name="two" xmlns:xacro="http://{site}/xacro">'

@@ -140,7 +140,7 @@ def test_panda_is_a_panda(panda):
     np.testing.assert_allclose(panda.lower[[0, 3]], [-2.8973, -3.0718])
     np.testing.assert_allclose(panda.upper[[0, 3]], [2.8973, -0.0698])
     assert np.all((panda.lower < panda.home) & (panda.home < panda.upper))
-    assert len(panda.collision_sphere_bodies) == len(panda.collision_spheres.radius) <= 45
+    assert len(panda.collision_sphere_bodies) == len(panda.collision_spheres.radius) <= 64
     assert (
         "link0" not in panda.collision_sphere_bodies
         and "link0" in panda.self_collision_sphere_bodies

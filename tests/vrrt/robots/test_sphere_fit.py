@@ -1,4 +1,4 @@
-"""The descent that fits spheres to a body."""
+"""Spheres that are fitted to a body."""
 
 import mujoco
 import numpy as np
@@ -21,16 +21,23 @@ def test_descent_beats_its_starts(rng):
     assert alarms < 1.05 * np.sum(gap.min(1) < samples.ball) * samples.cell
 
 
-def test_a_sphere_may_begin_on_a_point_that_it_covers(rng, monkeypatch):
-    monkeypatch.setattr(sphere_fit, "_STEPS", 3)
-    points = rng.uniform(-0.1, 0.1, (12, 3))
+def test_a_sphere_that_others_can_do_without_halves_the_work_of_a_bad_one(rng):
+    """The first of three spheres lies in the second; all alarms are around the third."""
+    points = np.linspace([-0.2, 0, 0], [0.2, 0, 0], 81)
     samples = sphere_fit.BodySamples(
         surface=points,
         inside=points,
-        num_surface=12,
-        outside=points + 0.3,
-        ball=np.full(12, 0.04),
+        num_surface=81,
+        outside=points[41:] + [0, 0.12, 0],
+        ball=np.full(40, 0.04),
         cell=1e-6,
     )
-    ((center, radius),) = sphere_fit._descended(samples, points[None, :1], np.full((1, 1), 0.1))
-    assert np.isfinite(center).all() and np.isfinite(radius).all()
+    center, radius = (
+        np.array([[-0.15, 0, 0], [-0.1, 0, 0], [0.1, 0, 0]]),
+        np.array([0.05, 0.1, 0.1]),
+    )
+    moved, smaller = sphere_fit._moved(samples, center, radius, rng)
+    assert np.array_equal(moved[1], center[1]) and smaller[1] == radius[1]
+    np.testing.assert_allclose((moved[0] + moved[2]) / 2, center[2])
+    np.testing.assert_allclose(np.linalg.norm(moved[0] - moved[2]), radius[2])
+    assert smaller[0] == smaller[2] < radius[2]

@@ -139,3 +139,15 @@ def test_a_problem_keeps_what_a_lens_has_left_unknown(shot, tmp_path):
     copy = load_problem(tmp_path / "copy", engine="closed_form")
     np.testing.assert_array_equal(copy.masks[0], known)
     assert Path(tmp_path / "copy" / "mask_1.png").is_file()
+
+
+def test_a_mask_file_may_be_0_and_1_and_must_not_be_inverted(tmp_path):
+    pose = {"position": [1.5, 0, 0.8], "target": [0, 0, 0.4], "fovy_deg": 45}
+    image, mask = np.full((40, 60, 3), 128, np.uint8), np.zeros((40, 60), np.uint8)
+    mask[10:, 20:40] = 1
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    photo = vrrt_jax.load_photo(image, pose, robot_mask=tmp_path / "mask.png")
+    np.testing.assert_array_equal(photo.image[..., 3], mask)
+    Image.fromarray(255 * (1 - mask)).save(tmp_path / "inverted.png")
+    with pytest.raises(ValueError, match="white on 90 % of the image's rim.*invert it"):
+        vrrt_jax.load_photo(image, pose, robot_mask=tmp_path / "inverted.png")
