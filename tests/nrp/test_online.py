@@ -13,6 +13,7 @@ import nrp_jax
 from nrp_jax import online
 from nrp_jax.cli import main
 from nrp_jax.learning import next_rows
+from nrp_jax.learning.batches import describe
 from nrp_jax.learning.checkpoint import build_module, load_model
 from nrp_jax.learning.data import Dataset
 from nrp_jax.learning.models import ModelConfig
@@ -123,6 +124,22 @@ def test_the_published_network_reads_its_plan_at_each_configuration():
     alone = apply(variables, plan, goal, q[:, 1:2], method="read")
     np.testing.assert_allclose(alone[0][0, 0], action[0, 1], atol=1e-5)
     np.testing.assert_allclose(alone[1][0, 0], value[0, 1], atol=1e-5)
+
+
+@pytest.mark.parametrize("task", ["snake", "fetch"])
+def test_the_light_network_sees_how_far_joints_turn_to_the_goal(task):
+    robot = nrp_jax.load_robot(task)
+    config = ModelConfig.default(task, "next")
+    rng = np.random.default_rng(0)
+    q = jnp.asarray(rng.uniform(-3.0, 3.0, (1, 2, robot.num_joints)), jnp.float32)
+    points = jax.vmap(jax.vmap(lambda q: nrp_jax.link_features(robot, q)))(q)
+    seen = describe(config, robot, q, points)
+    module = build_module(config, robot.num_joints)
+    turns = module.apply({}, seen[:, :1], seen[:, 1:], method="_turns")
+    turn = np.asarray(q[0, 1] - q[0, 0])[np.array(robot.angular)]
+    np.testing.assert_allclose(turns[0][0, 0], turn, atol=1e-5)
+    short = turn - 2 * np.pi * np.round(turn / (2 * np.pi))
+    np.testing.assert_allclose(turns[1][0, 0], short, atol=1e-5)
 
 
 def test_it_learns_from_paths_and_goes_on_where_it_was(
