@@ -70,7 +70,10 @@ class OnlineConfig:
 
     @classmethod
     def light(cls) -> Self:
-        """For two cores: a tenth of the problems, fewer epochs, shorter rounds, and symmetries."""
+        """For two cores: a tenth of the problems, fewer epochs, shorter rounds, and symmetries.
+
+        A batch has the states of two goals, with ten paths of the expert to each.
+        """
         return cls(
             epochs=8,
             batch=720,
