@@ -44,9 +44,8 @@ class ModelConfig:
         """The light architecture: patches merged by matrix products, heights as channels."""
         check_choices(task, kind, scope)
         if kind == NEXT:
-            patches = (5, 2) if task == "snake" else (5, 3)
             turning = 6 if task == "snake" else 8
-            whole = {"scope": "map", "lookup": False, "patches": patches}
+            whole = {"scope": "map", "lookup": False, "patches": (5, 2)}
             return cls(task=task, kind=kind, attention=4, turning=turning, **whole)
         scope = "map" if kind == GLOBAL_CVAE else scope
         wide = {"channels": (64, 96), "context": 192} if task == "fetch" else {}
