@@ -54,7 +54,7 @@ class OnlineConfig:
     batch: int = setting(256, 1, 65_536)  # states a step
     learning_rate: float = setting(1e-3, 1e-8, 1.0)
     weight_decay: float = setting(5e-5, 0.0, 1.0)  # in the gradient
-    step: float = setting(1.0, 0.0, 1e3)  # along a path, which the network learns [m]
+    step: float = setting(1.0, 0.01, 1e3)  # along a path, which the network learns [m]
     value_weight: float = setting(0.1, 0.0, 1e3)  # of the values' squared error in the loss
     augment: bool = False  # turn and mirror each path at random
     problems: int = setting(9000, 0, 1_000_000)  # that its planner tries in the training homes

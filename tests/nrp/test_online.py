@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -135,7 +136,7 @@ def test_the_light_network_sees_how_far_joints_turn_to_the_goal(task):
     points = jax.vmap(jax.vmap(lambda q: nrp_jax.link_features(robot, q)))(q)
     seen = describe(config, robot, q, points)
     module = build_module(config, robot.num_joints)
-    turns = module.apply({}, seen[:, :1], seen[:, 1:], method="_turns")
+    turns: Any = module.apply({}, seen[:, :1], seen[:, 1:], method="_turns")
     turn = np.asarray(q[0, 1] - q[0, 0])[np.array(robot.angular)]
     np.testing.assert_allclose(turns[0][0, 0], turn, atol=1e-5)
     short = turn - 2 * np.pi * np.round(turn / (2 * np.pi))
