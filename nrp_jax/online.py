@@ -147,15 +147,15 @@ def train_online(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Data:
-    """The paths so far: the expert's, and those that the planner found."""
+    """The paths so far: the expert's, and those that the planner found, each to its own goal."""
 
     examples: PathExamples
-    training: np.ndarray  # indices of the expert's paths to train on
+    training: np.ndarray  # indices of the expert's goals to train on
     validation: np.ndarray  # and of those in homes held out
     training_homes: np.ndarray
-    size: int  # paths of a batch
+    size: int  # goals of a batch
     num_expert: int
-    num: int  # paths in all
+    num: int  # goals in all
     tried: int = 0  # problems
     rounds: int = 0
     solved: float = 0.0  # share of the last round's problems
@@ -165,12 +165,12 @@ class _Data:
         cls, config: ModelConfig, robot: MobileRobot, dataset: Dataset, settings: OnlineConfig
     ) -> "_Data":
         """The expert's paths, with room for one of each problem."""
-        examples = path_examples(config, robot, dataset, settings.problems)
-        num = len(dataset) // dataset.settings.waypoints
+        examples, num = path_examples(config, robot, dataset, settings.problems)
         home = np.asarray(examples.home)[:num]
         split = TrainConfig(seed=settings.seed, validation=settings.validation)
         training, validation = split_by_home(home, split)
-        size = max(settings.batch // (examples.q.shape[1] - 1), 1)
+        most = examples.length.shape[1]
+        size = max(settings.batch // (examples.q.shape[1] - most), 1)
         return cls(
             examples=examples,
             training=training,
@@ -183,7 +183,7 @@ class _Data:
 
     def after(self, robot: MobileRobot, found: FoundPaths) -> "_Data":
         """With what a round found."""
-        added = found.home, found.q, found.length
+        added = found.home, found.q[:, None], found.length[:, None]
         return dataclasses.replace(
             self,
             examples=with_paths(robot, self.examples, self.num, *added),
@@ -194,7 +194,7 @@ class _Data:
         )
 
     def batches(self, seed: list[int]) -> np.ndarray:
-        """All paths to train on, in a random order, as batches (k, size)."""
+        """All goals to train on, in a random order, as batches (k, size)."""
         chosen = np.concatenate([self.training, np.arange(self.num_expert, self.num)])
         order = np.random.default_rng(seed).permutation(chosen)
         return order[: len(order) // self.size * self.size].reshape(-1, self.size)
@@ -208,7 +208,8 @@ def _network(
     optimizer = optax.chain(
         optax.add_decayed_weights(settings.weight_decay), optax.adam(settings.learning_rate)
     )
-    shapes = jax.eval_shape(partial(path_batch, config, robot), examples, jnp.zeros(1, jnp.int32))
+    batch_of = partial(path_batch, config, robot, step=settings.step)
+    shapes = jax.eval_shape(batch_of, examples, jnp.zeros(1, jnp.int32))
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     key = jax.random.key(settings.seed)
     variables: Any = jax.jit(module.init)(key, zeros.image, zeros.goal, zeros.q)
@@ -223,13 +224,14 @@ def _programs(
     optimizer: optax.GradientTransformation,
     settings: OnlineConfig,
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Compiled: a step of the optimizer on chosen paths (n,), and the errors of some."""
+    """Compiled: a step of the optimizer on chosen goals (n,), and the errors of some."""
     loss_of = partial(next_loss, module)
 
     @jax.jit
     def update(state: State, examples: PathExamples, chosen: jax.Array):
         key = jax.random.fold_in(jax.random.key(settings.seed), state.step)
-        batch = path_batch(config, robot, examples, chosen, key if settings.augment else None)
+        key = key if settings.augment else None
+        batch = path_batch(config, robot, examples, chosen, settings.step, key)
         gradient_of = jax.value_and_grad(loss_of, has_aux=True)
         (loss, _), gradient = gradient_of(state.variables, batch, settings.value_weight)
         updates, moments = optimizer.update(gradient, state.optimizer, state.variables)
@@ -238,7 +240,7 @@ def _programs(
 
     @jax.jit
     def evaluate(variables: Any, examples: PathExamples, chosen: jax.Array):
-        batch = path_batch(config, robot, examples, chosen)
+        batch = path_batch(config, robot, examples, chosen, settings.step)
         return loss_of(variables, batch, settings.value_weight)
 
     return update, evaluate

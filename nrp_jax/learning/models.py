@@ -37,16 +37,16 @@ class ModelConfig:
     kl_weight: float = 0.01  # of the CVAE's KL term
     attention: int = 8  # channels that NEXT attends to
     iterations: int = 20  # of the module with which NEXT plans on the map
+    turning: int = 0  # joints whose turns to the goal NEXT sees, those with cosines and sines
 
     @classmethod
     def default(cls, task: str, kind: str, scope: str = "window") -> "ModelConfig":
         """The light architecture: patches merged by matrix products, heights as channels."""
         check_choices(task, kind, scope)
         if kind == NEXT:
-            patches = (5, 2) if task == "snake" else (5, 3)
-            return cls(
-                task=task, kind=kind, scope="map", lookup=False, patches=patches, attention=4
-            )
+            turning = 6 if task == "snake" else 8
+            whole = {"scope": "map", "lookup": False, "patches": (5, 2)}
+            return cls(task=task, kind=kind, attention=4, turning=turning, **whole)
         scope = "map" if kind == GLOBAL_CVAE else scope
         wide = {"channels": (64, 96), "context": 192} if task == "fetch" else {}
         if scope == "map":

@@ -87,11 +87,23 @@ class PlanningNetwork(nn.Module):
             # The light network also sees both configurations as they are.
             x = x.reshape(*x.shape[:2], -1)
             goal = jnp.broadcast_to(goal[:, None], q.shape)
-            x = jnp.concatenate([x, q, goal, goal - q], axis=-1)
+            seen = [x, q, goal, goal - q]
+            if self.config.turning:
+                seen += self._turns(q, goal)
+            x = jnp.concatenate(seen, axis=-1)
         for layer in self.head:
             x = nn.relu(layer(x))
         answer = self.answer(x)
         return answer[..., :-1], answer[..., -1]
+
+    def _turns(self, q: jax.Array, goal: jax.Array) -> list[jax.Array]:
+        """How far joints turn from ``q`` to the goal (n, C, E), as they are and the short way."""
+        num = self.config.turning
+        first = self.num_joints - num  # features begin with sliding joints, cosines and sines
+        cosines, sines = slice(first, first + num), slice(first + num, first + 2 * num)
+        here, there = (jnp.arctan2(x[..., sines], x[..., cosines]) for x in (q, goal))
+        turn = there - here
+        return [turn, jnp.arctan2(jnp.sin(turn), jnp.cos(turn))]
 
 
 class Attention(nn.Module):

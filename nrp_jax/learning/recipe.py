@@ -54,6 +54,7 @@ class OnlineConfig:
     batch: int = setting(256, 1, 65_536)  # states a step
     learning_rate: float = setting(1e-3, 1e-8, 1.0)
     weight_decay: float = setting(5e-5, 0.0, 1.0)  # in the gradient
+    step: float = setting(1.0, 0.01, 1e3)  # along a path, which the network learns [m]
     value_weight: float = setting(0.1, 0.0, 1e3)  # of the values' squared error in the loss
     augment: bool = False  # turn and mirror each path at random
     problems: int = setting(9000, 0, 1_000_000)  # that its planner tries in the training homes
@@ -69,8 +70,19 @@ class OnlineConfig:
 
     @classmethod
     def light(cls) -> Self:
-        """For two cores: a tenth of the problems, fewer epochs, shorter rounds, and symmetries."""
-        return cls(epochs=8, problems=900, states=1000, round_epochs=1, augment=True, minutes=60.0)
+        """For two cores: a tenth of the problems, fewer epochs, shorter rounds, and symmetries.
+
+        A batch has the states of two goals, with ten paths of the expert to each.
+        """
+        return cls(
+            epochs=8,
+            batch=720,
+            problems=900,
+            states=1000,
+            round_epochs=1,
+            augment=True,
+            minutes=60.0,
+        )
 
     def explored_in(self, problem: int) -> float:
         """The share of RRT*'s expansions in a problem."""

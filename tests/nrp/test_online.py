@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ import nrp_jax
 from nrp_jax import online
 from nrp_jax.cli import main
 from nrp_jax.learning import next_rows
+from nrp_jax.learning.batches import describe
 from nrp_jax.learning.checkpoint import build_module, load_model
 from nrp_jax.learning.data import Dataset
 from nrp_jax.learning.models import ModelConfig
@@ -57,18 +59,46 @@ def dataset():
     return Dataset(settings=settings, grids=grids, rows=rows)
 
 
-def test_rows_tell_the_next_state_and_what_is_left(robot, dataset):
-    examples = next_rows.path_examples(CONFIG, robot, dataset, room=2)
-    assert examples.q.shape == (38, STATES + 2, 8)
-    batch = next_rows.path_batch(CONFIG, robot, examples, jnp.arange(36))
-    step = np.asarray(examples.q[:36, 1:] - examples.q[:36, :-1])
-    turned = step - 2 * np.pi * np.round(step / (2 * np.pi)) * np.asarray(robot.is_continuous)
-    np.testing.assert_allclose(batch.action, turned, atol=1e-5)
-    length = np.asarray(examples.length[:36, None])
+def test_rows_tell_a_step_of_one_length_and_what_is_left(robot, dataset):
+    """Against a plain walk along the path; the last steps end at the goal."""
+    examples, num = next_rows.path_examples(CONFIG, robot, dataset, room=2)
+    assert num == 36 and examples.q.shape == (38, STATES + 2, 8)
+    batch = next_rows.path_batch(CONFIG, robot, examples, jnp.arange(36), step=2.0)
+    length = np.asarray(examples.length[:36])  # (36, 1)
     left = length * np.arange(STATES + 1, 0, -1) / (STATES + 1)
     np.testing.assert_allclose(batch.value, -left, rtol=1e-5)
+    q = np.asarray(examples.q[:36])
+    step = q[:, 1:] - q[:, :-1]
+    step -= 2 * np.pi * np.round(step / (2 * np.pi)) * np.asarray(robot.is_continuous)
+    for path in range(36):
+        for state in range(STATES + 1):
+            expected, still = 0.0, 2.0
+            for between in step[path, state:]:
+                share = min(still * (STATES + 1) / length[path, 0], 1.0)
+                expected = expected + share * between
+                still -= share * length[path, 0] / (STATES + 1)
+            np.testing.assert_allclose(batch.action[path, state], expected, atol=1e-5)
     with pytest.raises(ValueError, match="paths of task 'snake'; expected paths of 'fetch'"):
         next_rows.path_examples(ModelConfig.default("fetch", "next"), robot, dataset, room=0)
+
+
+def test_paths_to_one_goal_stand_together(robot, dataset):
+    """They are planned for once; where a goal has fewer, the others weigh nothing."""
+    rows = {name: column.copy() for name, column in dataset.rows.items()}
+    rows["q_goal"][: 2 * STATES] = rows["q_goal"][0]  # the first two paths
+    shared = dataclasses.replace(dataset, rows=rows)
+    examples, num = next_rows.path_examples(CONFIG, robot, shared, room=1)
+    assert num == 35 and examples.length.shape == (36, 2)
+    lengths = np.sort(np.asarray(examples.length[:35]).ravel())
+    alone = np.asarray(next_rows.path_examples(CONFIG, robot, dataset, room=0)[0].length).ravel()
+    np.testing.assert_allclose(lengths, np.concatenate([np.zeros(34), np.sort(alone)]))
+    both = int(np.argmax(examples.length[:, 1]))
+    apart = next_rows.path_batch(CONFIG, robot, examples, jnp.arange(35), step=2.0)
+    assert np.asarray(apart.weight[both]).all()
+    assert np.asarray(apart.weight).sum() == 36 * (STATES + 1)
+    q = np.asarray(examples.q[both]).reshape(2, STATES + 2, 8)
+    np.testing.assert_array_equal(q[0, -1], q[1, -1])
+    np.testing.assert_array_equal(q[0, -1], rows["q_goal"][0].astype(np.float32))
 
 
 def test_a_path_is_parted_evenly(robot, dataset):
@@ -95,6 +125,22 @@ def test_the_published_network_reads_its_plan_at_each_configuration():
     alone = apply(variables, plan, goal, q[:, 1:2], method="read")
     np.testing.assert_allclose(alone[0][0, 0], action[0, 1], atol=1e-5)
     np.testing.assert_allclose(alone[1][0, 0], value[0, 1], atol=1e-5)
+
+
+@pytest.mark.parametrize("task", ["snake", "fetch"])
+def test_the_light_network_sees_how_far_joints_turn_to_the_goal(task):
+    robot = nrp_jax.load_robot(task)
+    config = ModelConfig.default(task, "next")
+    rng = np.random.default_rng(0)
+    q = jnp.asarray(rng.uniform(-3.0, 3.0, (1, 2, robot.num_joints)), jnp.float32)
+    points = jax.vmap(jax.vmap(lambda q: nrp_jax.link_features(robot, q)))(q)
+    seen = describe(config, robot, q, points)
+    module = build_module(config, robot.num_joints)
+    turns: Any = module.apply({}, seen[:, :1], seen[:, 1:], method="_turns")
+    turn = np.asarray(q[0, 1] - q[0, 0])[np.array(robot.angular)]
+    np.testing.assert_allclose(turns[0][0, 0], turn, atol=1e-5)
+    short = turn - 2 * np.pi * np.round(turn / (2 * np.pi))
+    np.testing.assert_allclose(turns[1][0, 0], short, atol=1e-5)
 
 
 def test_it_learns_from_paths_and_goes_on_where_it_was(
