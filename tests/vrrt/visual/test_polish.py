@@ -18,7 +18,7 @@ from vrrt_jax.visual.least_squares import (
     linearize,
     settle_each,
 )
-from vrrt_jax.visual.polish import _hand_goal, joint_uncertainty, polish
+from vrrt_jax.visual.polish import _freed, _hand_goal, joint_uncertainty, polish
 from vrrt_jax.visual.polish_samples import nearer_turns, redraw_outer
 from vrrt_jax.visual.problem import make_problem
 
@@ -136,3 +136,26 @@ def test_of_whole_turns_the_next_to_the_start_is_taken():
     np.testing.assert_allclose(nearer, expected)
     poses = [vrrt_jax.link_poses(ur5e.chain, jnp.asarray(a[0], jnp.float32)) for a in (q, nearer)]
     np.testing.assert_allclose(*poses, atol=1e-5)
+
+
+def test_an_end_that_touches_gives_way_to_a_free_one_beside_it(panda, self_model, camera):
+    hand, away = _hand_position(panda, Q_GOAL), 0.3
+    for _ in range(20):  # a ball that the hand is in by 2 mm
+        place = tuple(float(x) for x in hand + np.array([away, 0.0, 0.0]))
+        ball = vrrt_jax.Obstacle(name="ball", kind="sphere", position=place, size=(0.03, 0.0, 0.0))
+        world = vrrt_jax.build_world(panda, [ball], engine="closed_form")
+        away -= float(world.obstacle_clearance(jnp.asarray(Q_GOAL))) + 0.002
+    image = picture(panda, self_model, camera, Q_GOAL, level=2)
+    fine = polishing_of(panda, self_model, camera, image, PlannerConfig()).fine
+    q = np.stack([Q_GOAL, Q_START]).astype(np.float32)
+    before = derivatives(world, fine, q)
+    assert before.free.tolist() == [False, True]
+    after = _freed(world, fine, before, 0)
+    assert after.free.all() and bool(world.is_free(jnp.asarray(after.q[0])))
+    assert np.abs(after.q[0] - Q_GOAL).mean() < 0.02
+    assert before.cost[0] < after.cost[0] < before.cost[1]
+    np.testing.assert_array_equal(after.q[1], before.q[1])
+    # Deep inside nothing beside it is free: it stays as it is.
+    ball = vrrt_jax.Obstacle(name="ball", kind="sphere", position=tuple(hand), size=(0.2, 0.0, 0.0))
+    deep = vrrt_jax.build_world(panda, [ball], engine="closed_form")
+    assert not _freed(deep, fine, derivatives(deep, fine, q[:1]), 0).free[0]
