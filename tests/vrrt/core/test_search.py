@@ -49,9 +49,10 @@ def test_budget_capacity_and_time_are_reported(wall_world):
             max_capacity=max_capacity,
         )
 
-    full = run(100, max_capacity=100)
-    assert full.stopped is StopReason.TREE_FULL and int(full.tree.size) == 100
-    assert int(full.tree.rejected[Rejection.CAPACITY]) > 0
+    full = [run(room, max_capacity=room) for room in (97, 98, 100)]
+    assert all(found.stopped is StopReason.TREE_FULL for found in full)
+    assert [int(found.tree.size) for found in full] == [97, 98, 100]
+    assert sum(int(found.tree.rejected[Rejection.CAPACITY]) for found in full) > 0
     few = run(4096, max_iterations=3)
     assert few.stopped is StopReason.ITERATIONS and int(few.tree.iteration) == 3
     assert run(4096, limit=0.0).stopped is StopReason.TIME_LIMIT
