@@ -121,7 +121,8 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
         ends = _distinct_ends(world, _settled(world, fine, ends.q), config.kept)
     else:
         ends = _settled_with_hand(world, polishing, polishing.close_up, ends)
-    ends = _distinct_ends(world, _freed(world, fine, ends, seed), config.kept)
+    ends = _freed(world, fine, ends, seed)
+    ends = ends.take(np.lexsort([ends.cost, ~ends.free]))
     judge = getattr(fine.goal, "judge", None)
     loss = ends.loss
     if judge is not None:
@@ -193,9 +194,8 @@ def joint_uncertainty(matrix: np.ndarray, threshold: float) -> np.ndarray:
 
 
 def _distinct_ends(world: World, ends: Ends, num: int) -> Ends:
-    """At most num, the free ones first and by rising cost; of near ones only the first."""
-    rows = distinct(world, ends.q, np.lexsort([ends.cost, ~ends.free]), num)
-    return ends.take(rows)
+    """At most num, by rising cost, free or not; of near ones only the first."""
+    return ends.take(distinct(world, ends.q, np.argsort(ends.cost, kind="stable"), num))
 
 
 def _turns_of_last_hinge(world: World, objective: Objective, q: np.ndarray, num: int) -> np.ndarray:
