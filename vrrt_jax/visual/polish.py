@@ -50,7 +50,7 @@ SETTLE_STEPS = 8  # at most, on the large images
 PROMISING = 6.0  # times the least cost; ends that cost more, and do not match, are left
 RIVALS = 2.0  # times the least cost; ends that cost more on the fine image are left
 TWINNED = 2  # best ends whose kinematic twins, and half turns of the hand, are looked at
-SAME_END = 0.1  # [rad] half turns of a hand this near to an end are that end
+SAME_END = 0.1  # [rad] half turns of a hand, and twins, this near to an end are that end
 BESIDE = (
     0.002,
     0.03,
@@ -220,17 +220,19 @@ def _joined(ends: Ends, others: Ends) -> Ends:
 
 
 def _settled_with_hand(world: World, polishing: Polishing, close_up: CloseUp, ends: Ends) -> Ends:
-    """Settle on the fine image and a close-up of the hand; also after half a turn of the hand."""
+    """Settle on fine image and close-up of the hand; so do half turns and twins of the best."""
     fine, num = polishing.fine, polishing.config.kept
     goal, threshold = _hand_goal(world, fine, close_up, ends.q[0])
     weight = polishing.threshold / threshold
     ends = _distinct_ends(world, _settled_together(world, fine, goal, weight, ends), num)
-    turned = nearer_turns(world, half_turned(world, ends.q[:TWINNED]), np.asarray(fine.prior.q))
-    turned = turned[[np.min(distances_to(world, ends.q, q)) > SAME_END for q in turned]]
-    if not len(turned):
+    best = ends.q[:TWINNED]
+    others = np.concatenate([half_turned(world, best), twins(world, best)])
+    others = nearer_turns(world, others, np.asarray(fine.prior.q))
+    others = others[[np.min(distances_to(world, ends.q, q)) > SAME_END for q in others]]
+    if not len(others):
         return ends
-    turned = _settled_together(world, fine, goal, weight, derivatives(world, fine, turned))
-    return _distinct_ends(world, _joined(ends, turned), num)
+    others = _settled_together(world, fine, goal, weight, derivatives(world, fine, others))
+    return _distinct_ends(world, _joined(ends, others), num)
 
 
 def _settled_together(
