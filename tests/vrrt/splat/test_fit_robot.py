@@ -83,9 +83,11 @@ def test_training_goes_on_where_it_was(made, tmp_path):
     shutil.copytree(made_folder, folder)
     before = vrrt_jax.load_self_model(folder / "self_model.npz")
     # The time is up before the first step: nothing changes, and what was rendered is kept.
+    # Other threads ask the same clock: only this module is told another time.
     clock = iter([0.0, 0.0, 0.0])
+    told_time = types.SimpleNamespace(monotonic=lambda: next(clock, 100.0))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit_robot.time, "monotonic", lambda: next(clock, 100.0))
+        patch.setattr(fit_robot, "time", told_time)
         record = fit_robot.fit_robot(file, folder, minutes=1.0, rounds=ROUNDS, progress=told.append)
     assert record.rounds == 1 and "time is up" in told[0]
     assert vrrt_jax.load_self_model(folder / "self_model.npz").info == before.info
