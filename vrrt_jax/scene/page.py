@@ -50,7 +50,7 @@ class Page:
         self._shown: dict[str, Any] = {}  # lines, pictures and the table, by name
         self._boxes: dict[str, Any] = {}  # that hide lines
         self._model: mujoco.MjModel | None = None
-        self._bodies: dict[int, Any] = {}  # all that are drawn, by number in the model
+        self.moving: dict[int, Any] = {}  # bodies that move, by number in the model
         self._poses: Any = None  # (T, nbody, 3) and (T, nbody, 4) along the path
         self._play: Any = None  # the button
         self.slider: Any = None  # along the path, once there is a robot
@@ -77,11 +77,6 @@ class Page:
         """The panel of viser, to add boxes and buttons to."""
         return self._server.gui
 
-    @property
-    def moving(self) -> dict[int, Any]:
-        """Bodies that move, by number in the model."""
-        return {body: handle for body, handle in self._bodies.items() if body}
-
     def look_from(self, eye: np.ndarray, target: np.ndarray, fovy: float = 0.8) -> None:
         """Look from a place (3,) to another [m] at first, with a vertical field of view [rad]."""
         camera = self._server.initial_camera
@@ -98,8 +93,11 @@ class Page:
         self._model = model
         for body in range(model.nbody):
             mesh = body_mesh(model, body, groups)
-            if mesh is not None:
-                self._bodies[body] = self.scene.add_mesh_trimesh(f"/bodies/{body}", mesh)
+            if mesh is None:
+                continue
+            handle = self.scene.add_mesh_trimesh(f"/bodies/{body}", mesh)
+            if body:  # the world's stands still
+                self.moving[body] = handle
         self._add_player()
 
     def show_trajectory(self, trajectory: np.ndarray) -> None:
@@ -120,7 +118,7 @@ class Page:
         position, quaternion = self._poses
         step = min(step, len(position) - 1)
         with self._server.atomic():
-            for body, handle in self._bodies.items():
+            for body, handle in self.moving.items():
                 handle.position, handle.wxyz = position[step, body], quaternion[step, body]
 
     def _add_player(self) -> None:
