@@ -2,19 +2,22 @@
 
 import dataclasses
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.compiling import compile_together
 from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.parallel import map_on_threads
 from vrrt_jax.core.planners.rrt import sample_configurations
+from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import ABORTED, PlanResult, Status, with_time_of
-from vrrt_jax.core.search import compile_search, make_termination, search
+from vrrt_jax.core.search import SearchResult, compile_search, make_termination, search
 from vrrt_jax.core.shortcut import shortcut
 from vrrt_jax.core.timing import timed
 from vrrt_jax.core.types import ExpansionPolicy, Goal, Tree
@@ -176,38 +179,59 @@ def plan_batch_by_loss(
     starts: Sequence[np.ndarray],
     keys: jax.Array,
     config: PlannerConfig,
+    devices: Sequence[Any],
     on_progress: Progress,
 ) -> list[PlanResult]:
-    """One attempt at each of Q problems, in one search over all of them; see ``plan_batch``."""
-    with interruptible():
+    """One attempt at each of Q problems, in one search over all of them; see ``plan_batch``.
+
+    Several devices share out the search, and then each finishes its own problems.
+    """
+    each = -(-len(problems) // len(devices))  # problems of a device
+    # As many for each device: the last problem again where there are too few.
+    places = np.minimum(np.arange(each * len(devices)), len(problems) - 1)
+    mesh = Mesh(np.array(devices), ("problems",)) if len(devices) > 1 else None
+
+    def search_all() -> SearchResult:
         trees = [
             policy.init(world, problem.goal, q_start[None], config.tree.capacity)
             for problem, q_start in zip(problems, starts, strict=True)
         ]
-        terminations = [termination_of(config, policy, problem.goal) for problem in problems]
-        found = search(
-            world,
-            _stack([problem.goal for problem in problems]),
-            policy,
-            _stack(trees),
-            key=keys,
-            termination=_stack(terminations),
+        goals = [problem.goal for problem in problems]
+        terminations = [termination_of(config, policy, goal) for goal in goals]
+        shared: Any = [_stack([part[i] for i in places]) for part in (goals, trees, terminations)]
+        shared.append(keys[places])
+        everywhere = world, policy
+        if mesh is not None:
+            shared = jax.device_put(shared, NamedSharding(mesh, PartitionSpec("problems")))
+            everywhere = jax.device_put(everywhere, NamedSharding(mesh, PartitionSpec()))
+        goal, tree, termination, own_keys = shared
+        return search(
+            everywhere[0],
+            goal,
+            everywhere[1],
+            tree,
+            key=own_keys,
+            termination=termination,
             time_limit_s=config.budget.time_limit_s,
             max_capacity=config.tree.max_capacity,
             batched=True,
+            mesh=mesh,
             on_progress=on_progress,
         )
-        results = []
-        for i, (q_start, problem) in enumerate(zip(starts, problems, strict=True)):
-            own = dataclasses.replace(
-                found,
-                tree=jax.tree.map(lambda leaf: leaf[i], found.tree),  # noqa: B023 - used at once
-                stopped=found.stopped_each[i],
-            )
-            results.append(
-                finish_visual(robot, world, problem, policy, own, q_start, keys[i], config)
-            )
-    return results
+
+    @single_precision
+    def finish_one(i: int) -> PlanResult:
+        own = dataclasses.replace(
+            found, tree=jax.tree.map(lambda leaf: leaf[i], trees), stopped=found.stopped_each[i]
+        )
+        with jax.default_device(devices[i // each]):
+            return finish_visual(robot, world, problems[i], policy, own, starts[i], keys[i], config)
+
+    with interruptible():
+        found = search_all()
+        trees = jax.device_get(found.tree) if mesh is not None else found.tree
+        with ThreadPoolExecutor(len(devices)) as pool:
+            return list(pool.map(finish_one, range(len(problems))))
 
 
 def _stack(items: Sequence[Any]) -> Any:

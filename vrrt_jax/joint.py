@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import jax
 import numpy as np
@@ -162,9 +163,10 @@ def plan_each_to_configuration(
     starts: Sequence[np.ndarray],
     keys: jax.Array,
     config: PlannerConfig,
+    devices: Sequence[Any],
     on_progress: Progress,
 ) -> list[PlanResult]:
-    """Q problems on as many threads as there are cores; see ``plan_batch``.
+    """Q problems on as many threads as there are cores, or devices; see ``plan_batch``.
 
     A search of one problem keeps one core busy. An outer ``vmap`` over problems is slower on a CPU:
     each of its steps waits for the problem that needs most checks.
@@ -172,8 +174,10 @@ def plan_each_to_configuration(
 
     def plan_one(index: int) -> PlanResult:
         own = robot, worlds[index], goals[index], policy, starts[index], keys[index]
-        return plan_to_goal(*own, config, on_progress)
+        with jax.default_device(devices[index % len(devices)]):
+            return plan_to_goal(*own, config, on_progress)
 
-    with interruptible(), ThreadPoolExecutor(usable_cores()) as pool:
+    threads = max(usable_cores(), len(devices))
+    with interruptible(), ThreadPoolExecutor(threads) as pool:
         # The first problem compiles what the others use. Ctrl-C ends all, each with its best path.
         return [plan_one(0), *pool.map(plan_one, range(1, len(goals)))]

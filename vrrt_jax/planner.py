@@ -175,6 +175,7 @@ def plan_batch(
     key: jax.Array,
     planner: str | ExpansionPolicy | None = None,
     config: PlannerConfig | None = None,
+    devices: Sequence[Any] | None = None,
     on_progress: Progress = None,
 ) -> list[PlanResult]: ...
 @overload
@@ -190,6 +191,7 @@ def plan_batch(
     key: jax.Array,
     planner: str | ExpansionPolicy | None = None,
     config: PlannerConfig | None = None,
+    devices: Sequence[Any] | None = None,
     on_progress: Progress = None,
 ) -> list[PlanResult]: ...
 @single_precision
@@ -202,6 +204,7 @@ def plan_batch(
     key: jax.Array,
     planner: str | ExpansionPolicy | None = None,
     config: PlannerConfig | None = None,
+    devices: Sequence[Any] | None = None,
     on_progress: Progress = None,
 ) -> list[PlanResult]:
     """Solve Q problems of one robot at once.
@@ -223,6 +226,8 @@ def plan_batch(
         key: random key.
         planner: see :func:`plan`.
         config: settings, the default ones if None.
+        devices: that share out the problems, such as ``jax.devices()``; the usual one if None. Each
+            compiles programs of its own.
         on_progress: called with the batched search state and the seconds so far.
 
     Raises:
@@ -244,6 +249,9 @@ def plan_batch(
             f"got {len(goals)} goals and {len(all_starts)} starts; expected as many, and one at "
             "least"
         )
+    devices = list(jnp.zeros(()).devices() if devices is None else devices)
+    if not devices:
+        raise ValueError("devices is an empty list; expected one at least, such as jax.devices()")
     policy = _policy(planner, goals[0], worlds[0], config)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(goals)))
     starts: list[np.ndarray] = []
@@ -261,12 +269,12 @@ def plan_batch(
             raise ValueError(f"problem {i}: {error}") from None
     if isinstance(goals[0], ConfigurationGoal):
         return plan_each_to_configuration(
-            robot, worlds, checked, policy, starts, keys, config, on_progress
+            robot, worlds, checked, policy, starts, keys, config, devices, on_progress
         )
     if any(own is not worlds[0] for own in worlds):
         raise ValueError("goals known by their loss are searched for in one world; got several")
     results = plan_batch_by_loss(
-        robot, worlds[0], checked, policy, starts, keys, config, on_progress
+        robot, worlds[0], checked, policy, starts, keys, config, devices, on_progress
     )
     return [_drawn(result, goal, robot) for result, goal in zip(results, goals, strict=True)]
 

@@ -22,11 +22,11 @@ from nrp_jax.bench.curve_table import to_text
 from nrp_jax.homes.houses import CELLS
 from nrp_jax.planners.by_name import check_names
 from nrp_jax.scene.robots import load_robot
-from vrrt_jax.core import command
+from vrrt_jax.core import command, workers
 from vrrt_jax.core.peers import ompl_version
 from vrrt_jax.core.results_file import append_row, plain, resume_rows, write
 from vrrt_jax.core.timing import machine, versions
-from vrrt_jax.core.workers import in_processes
+from vrrt_jax.core.workers import in_workers
 
 FORMAT = 1
 
@@ -39,6 +39,7 @@ class CurveBenchmark:
     planners: tuple[str, ...]  # of by_name.PLANNERS or ompl_peers.PEERS
     runs: int = 1
     jobs: int = 1
+    cluster: str | None = None  # address of a Ray cluster, instead of processes
 
     def header(self) -> dict[str, Any]:
         """What rows must agree on, to be gone on with."""
@@ -107,7 +108,7 @@ def measure(
     work = partial(run_item, benchmark.setting)
     won = tried = 0
     with tqdm(total=len(todo), unit="plan", disable=None) as bar:
-        for row in in_processes(work, todo, benchmark.jobs):
+        for row in in_workers(work, todo, benchmark.jobs, benchmark.cluster):
             rows.append(row)
             if rows_file is not None:
                 append_row(rows_file, row)
@@ -178,7 +179,7 @@ def add_measuring(parser: argparse.ArgumentParser, seed_help: str) -> None:
     """Add how often and how long plans are measured, and where rows go."""
     count = command.whole(1, 100_000)
     parser.add_argument("--runs", type=count, default=1, help="of each query")
-    parser.add_argument("--jobs", type=count, default=1, help="processes")
+    workers.add_arguments(parser)
     parser.add_argument(
         "--budget", type=command.real(0.01, 1e6), default=10.0, help="of each search [s]"
     )
@@ -197,7 +198,9 @@ def _run_command(arguments: argparse.Namespace) -> int:
         **{name: getattr(arguments, name) for name in ("task", "lanes", "nodes", "seed")},
     )
     benchmark = CurveBenchmark(
-        setting=setting, planners=planners, runs=arguments.runs, jobs=arguments.jobs
+        setting=setting,
+        planners=planners,
+        **{name: getattr(arguments, name) for name in ("runs", "jobs", "cluster")},
     )
     file = None if arguments.json is None else Path(arguments.json)
     print(to_text(run(benchmark, file)))

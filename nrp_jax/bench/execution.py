@@ -105,7 +105,9 @@ def _run_command(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
     )
     benchmark = CurveBenchmark(
-        setting=setting, planners=planners, runs=arguments.runs, jobs=arguments.jobs
+        setting=setting,
+        planners=planners,
+        **{name: getattr(arguments, name) for name in ("runs", "jobs", "cluster")},
     )
     file = None if arguments.json is None else Path(arguments.json)
     header, rows = measure(benchmark, file)

@@ -24,7 +24,7 @@ from nrp_jax.learning.shards import (
     make_shards,
     shard_name,
 )
-from vrrt_jax.core import command
+from vrrt_jax.core import command, workers
 from vrrt_jax.core.command import usable_cores
 from vrrt_jax.core.files import UNFINISHED, replacing
 from vrrt_jax.core.precision import single_precision
@@ -55,6 +55,7 @@ def write_dataset(
     homes: int = 25,
     test_homes: int = 5,
     jobs: int = 1,
+    cluster: str | None = None,
     on_progress: Callable[[int, int], Any] | None = None,
 ) -> dict[str, Any]:
     """Write a data set: all shards of it that are missing or damaged.
@@ -65,6 +66,7 @@ def write_dataset(
         homes: homes for training.
         test_homes: homes for tests, which no training home equals.
         jobs: processes.
+        cluster: address of a Ray cluster, instead of processes.
         on_progress: called with shards done and shards in all.
 
     Returns:
@@ -82,9 +84,10 @@ def write_dataset(
     done = len(wanted) - len(todo)
     if on_progress is not None:
         on_progress(done, len(wanted))
-    for name, entry in make_shards(out, settings, todo, jobs):
+    for name, entry in make_shards(out, settings, todo, jobs, cluster):
         # The manifest is written after each shard, so that a killed run can be continued.
-        manifest["shards"][name] = entry
+        # In the order of names, whatever came first.
+        manifest["shards"] = dict(sorted({**manifest["shards"], name: entry}.items()))
         manifest["rows"] = sum(shard["rows"] for shard in manifest["shards"].values())
         _write_manifest(out, manifest)
         done += 1
@@ -258,9 +261,7 @@ def add_arguments(subparsers) -> None:
     kind.add_argument(
         "--experiences", action="store_true", help="corners of shortened paths, for --model fire"
     )
-    parser.add_argument(
-        "--jobs", type=command.whole(1, 1024), default=usable_cores(), help="processes"
-    )
+    workers.add_arguments(parser, jobs=usable_cores())
 
 
 def _run_command(arguments: argparse.Namespace) -> int:
@@ -288,6 +289,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
             homes=arguments.homes,
             test_homes=arguments.test_homes,
             jobs=arguments.jobs,
+            cluster=arguments.cluster,
             on_progress=on_progress,
         )
     print(f"{manifest['rows']} rows of {len(manifest['shards'])} homes in {arguments.out}")

@@ -1,11 +1,10 @@
-"""Shards of data sets: the rows of one home each, made one by one or in several processes."""
+"""Shards of data sets: the rows of one home each, made here or by several workers."""
 
-import concurrent.futures
 import dataclasses
 import hashlib
-import multiprocessing
-import os
+import io
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,8 @@ from nrp_jax.learning.paths import make_path_rows
 from nrp_jax.learning.roadmap import build_roadmap
 from nrp_jax.scene.robots import load_robot
 from nrp_jax.scene.world import build_world
-from vrrt_jax.core.command import end_with_parent
 from vrrt_jax.core.files import replacing
+from vrrt_jax.core.workers import in_workers
 
 VERSION = 6  # of rows, checks of their edges and choice of homes; other versions are refused
 ROWS = ("q_start", "q_goal", "waypoint", "optimal", "ratio", "length", "query")
@@ -53,19 +52,17 @@ def shard_name(split: str, index: int) -> str:
     return f"{split}_{index:05d}.npz"
 
 
-def make_shard(settings: DatasetSettings, split: str, index: int, path: Path) -> dict[str, Any]:
-    """Generate a home, ask the expert about it and write the rows.
+def make_shard(settings: DatasetSettings, wanted: tuple[str, int]) -> tuple[str, int, bytes]:
+    """Generate a home, ask the expert about it, and pack the rows.
 
     Args:
         settings: of the data set.
-        split: "train" or "test".
-        index: of the home in its split.
-        path: the file to write.
+        wanted: split, "train" or "test", and index of the home in it.
 
     Returns:
-        The shard's entry in the manifest: number of rows, seed of the home, and checksum.
+        The name of the shard's file, its number of rows, and what it holds.
     """
-    seed = home_seed(settings, split, index)
+    seed = home_seed(settings, *wanted)
     robot = load_robot(settings.task)
     house = fair_house(robot, seed)
     world = build_world(robot, house.grid)
@@ -74,70 +71,41 @@ def make_shard(settings: DatasetSettings, split: str, index: int, path: Path) ->
     make = make_path_rows if settings.paths else make_rows
     make = make_experience_rows if settings.experiences else make
     rows = make(world, robot, roadmap, rng, settings.queries, settings.waypoints)
-    with replacing(path) as file:
-        np.savez_compressed(
-            file,
-            occupied=np.packbits(house.grid.occupied, axis=-1),
-            layers=house.grid.occupied.shape[2],
-            **{key: getattr(rows, key) for key in ROWS},
-        )
-    return {"rows": len(rows.ratio), "seed": seed, "sha256": checksum(path)}
+    packed = io.BytesIO()
+    np.savez_compressed(
+        packed,
+        occupied=np.packbits(house.grid.occupied, axis=-1),
+        layers=house.grid.occupied.shape[2],
+        **{key: getattr(rows, key) for key in ROWS},
+    )
+    return shard_name(*wanted), len(rows.ratio), packed.getvalue()
 
 
 def make_shards(
-    out: Path, settings: DatasetSettings, wanted: Sequence[tuple[str, int]], jobs: int
+    out: Path,
+    settings: DatasetSettings,
+    wanted: Sequence[tuple[str, int]],
+    jobs: int,
+    cluster: str | None = None,
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Make several shards, in several processes if asked to.
+    """Make several shards and write them.
 
     Args:
         out: folder.
         settings: of the data set.
         wanted: split and index of each shard.
         jobs: processes.
+        cluster: address of a Ray cluster, instead of processes.
 
     Yields:
-        The name and manifest entry of each shard, as soon as it is written.
+        The name of each shard, as soon as it is written, and its entry in the manifest: number of
+        rows, seed of the home, and checksum.
     """
-    if jobs == 1 or len(wanted) <= 1:
-        for split, index in wanted:
-            name = shard_name(split, index)
-            yield name, make_shard(settings, split, index, out / name)
-        return
-    pool = concurrent.futures.ProcessPoolExecutor(
-        min(jobs, len(wanted)),
-        multiprocessing.get_context("spawn"),
-        _start_worker,
-        (jax.config.jax_compilation_cache_dir,),
-    )
-    try:
-        names = {}
-        for split, index in wanted:
-            name = shard_name(split, index)
-            names[pool.submit(make_shard, settings, split, index, out / name)] = name
-        # After a failure no shard is begun, but those under way are finished and kept.
-        failure = None
-        for future in concurrent.futures.as_completed(names):
-            if future.cancelled():
-                continue
-            if problem := future.exception():
-                failure = failure or problem
-                for other in names:
-                    other.cancel()
-            else:
-                yield names[future], future.result()
-        if failure:
-            raise failure
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _start_worker(cache: str | None) -> None:
-    """Give a worker process one thread (XLA reads NPROC when it starts) and the parent's cache."""
-    end_with_parent()
-    os.environ["NPROC"] = "1"
-    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
-    jax.config.update("jax_compilation_cache_dir", cache)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    seeds = {shard_name(*one): home_seed(settings, *one) for one in wanted}
+    for name, rows, packed in in_workers(partial(make_shard, settings), wanted, jobs, cluster):
+        with replacing(out / name) as file:
+            file.write(packed)
+        yield name, {"rows": rows, "seed": seeds[name], "sha256": checksum(out / name)}
 
 
 def checksum(path: Path) -> str:

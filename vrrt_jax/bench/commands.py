@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from vrrt_jax.core import command
+from vrrt_jax.core import command, workers
 from vrrt_jax.core.command import EXIT_SOLVED
 
 
@@ -105,7 +105,7 @@ def _add_protocol(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument(
         "--time-limit", type=command.seconds, default=60.0, help="of one search [s]"
     )
-    parser.add_argument("--jobs", type=command.whole(1, 1024), default=1, help="processes")
+    workers.add_arguments(parser)
     parser.add_argument("--json", help="write results here; go on from what it holds")
 
 
@@ -173,7 +173,7 @@ def _add_dream(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--time-limit", type=command.seconds, default=60.0, help="of one search [s]"
     )
-    parser.add_argument("--jobs", type=command.whole(1, 1024), default=1, help="processes")
+    workers.add_arguments(parser)
     parser.add_argument("--json", help="write results here; go on from what it holds")
 
 
@@ -233,7 +233,8 @@ def _protocol(arguments: argparse.Namespace) -> int:
         ),
         **chosen,
     )
-    print(tables.to_text(runner.run(benchmark, arguments.json, jobs=arguments.jobs)))
+    where = {name: getattr(arguments, name) for name in ("jobs", "cluster")}
+    print(tables.to_text(runner.run(benchmark, arguments.json, **where)))
     return EXIT_SOLVED
 
 
@@ -266,7 +267,8 @@ def _dream(arguments: argparse.Namespace) -> int:
         config=PlannerConfig().changed({"budget.time_limit_s": arguments.time_limit}),
         **{name: getattr(arguments, name) for name in names},
     )
-    print(dream_table.to_text(dream.run(benchmark, arguments.json, jobs=arguments.jobs)))
+    where = {name: getattr(arguments, name) for name in ("jobs", "cluster")}
+    print(dream_table.to_text(dream.run(benchmark, arguments.json, **where)))
     return EXIT_SOLVED
 
 

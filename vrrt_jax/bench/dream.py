@@ -25,7 +25,7 @@ from vrrt_jax.core.data_file import read_fields
 from vrrt_jax.core.interrupt import uninterrupted
 from vrrt_jax.core.results_file import fingerprint, plain, resume, write
 from vrrt_jax.core.timing import machine, versions
-from vrrt_jax.core.workers import in_processes
+from vrrt_jax.core.workers import in_workers
 from vrrt_jax.problems import self_model_path
 from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.robots.robot import Robot
@@ -83,13 +83,20 @@ class DreamBenchmark:
         )
 
 
-def run(benchmark: DreamBenchmark, file: str | Path | None, *, jobs: int = 1) -> dict[str, Any]:
+def run(
+    benchmark: DreamBenchmark,
+    file: str | Path | None,
+    *,
+    jobs: int = 1,
+    cluster: str | None = None,
+) -> dict[str, Any]:
     """Run what is not in the file yet, and write every frame at once.
 
     Args:
         benchmark: what to run; more frames or levels than the file has are added to it.
         file: JSON for the results, None to keep them in memory.
         jobs: processes.
+        cluster: address of a Ray cluster, instead of processes.
 
     Returns:
         What the file holds: the header, ``machine``, ``rows``, and ``levels`` with what is told of
@@ -116,8 +123,11 @@ def run(benchmark: DreamBenchmark, file: str | Path | None, *, jobs: int = 1) ->
         if (name, level) not in done
     ]
     with tqdm(total=len(todo), unit="frame", disable=None) as bar:
-        for row in in_processes(partial(_run_frame, benchmark), todo, jobs):
-            results["rows"].append(row)
+        for row in in_workers(partial(_run_frame, benchmark), todo, jobs, cluster):
+            # In the order of frames, whatever came first.
+            results["rows"] = sorted(
+                [*results["rows"], row], key=lambda r: (r["frame"], r["level"])
+            )
             results["levels"] = summarize(results["rows"])
             if file is not None:
                 write(Path(file), results)

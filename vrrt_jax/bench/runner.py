@@ -16,7 +16,7 @@ from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.interrupt import uninterrupted
 from vrrt_jax.core.results_file import fingerprint, plain, resume, write
 from vrrt_jax.core.timing import machine, versions
-from vrrt_jax.core.workers import in_processes
+from vrrt_jax.core.workers import in_workers
 from vrrt_jax.problems import self_model_path
 
 FORMAT = 4
@@ -73,13 +73,16 @@ class Benchmark:
         }
 
 
-def run(benchmark: Benchmark, file: str | Path | None, *, jobs: int = 1) -> dict[str, Any]:
+def run(
+    benchmark: Benchmark, file: str | Path | None, *, jobs: int = 1, cluster: str | None = None
+) -> dict[str, Any]:
     """Run what is not in the file yet, and write every task at once.
 
     Args:
         benchmark: what to run; more levels or tasks than the file has are added to it.
         file: JSON for the results, None to keep them in memory.
         jobs: processes.
+        cluster: address of a Ray cluster, instead of processes.
 
     Returns:
         What the file holds: the header, ``tasks``, and a summary of each variant.
@@ -99,10 +102,13 @@ def run(benchmark: Benchmark, file: str | Path | None, *, jobs: int = 1) -> dict
         for variant in benchmark.variants
         if (variant.name, level, index) not in done
     ]
+    order = partial(_place, benchmark)
     with tqdm(total=len(todo), unit="task", disable=None) as bar:
         won = 0
-        for count, row in enumerate(in_processes(partial(_run_task, benchmark), todo, jobs), 1):
-            results["tasks"].append(row)
+        rows = in_workers(partial(_run_task, benchmark), todo, jobs, cluster)
+        for count, row in enumerate(rows, 1):
+            # In the order of tasks, whatever came first.
+            results["tasks"] = sorted([*results["tasks"], row], key=order)
             results.update(_summary(benchmark, results["tasks"]))
             if file is not None:
                 write(Path(file), results)
@@ -130,6 +136,13 @@ def _run_task(benchmark: Benchmark, item: tuple[str, float | str, int]) -> dict[
             engine=benchmark.engine,
         )
     return {"variant": name, **row}
+
+
+def _place(benchmark: Benchmark, row: dict[str, Any]) -> tuple[int, ...]:
+    """Where a row stands in a file; levels that were asked for in an earlier run are last."""
+    names, levels = [v.name for v in benchmark.variants], list(benchmark.levels)
+    level = levels.index(row["level"]) if row["level"] in levels else len(levels)
+    return row["index"], level, names.index(row["variant"])
 
 
 def _key(row: dict[str, Any]) -> tuple[str, float | str, int]:

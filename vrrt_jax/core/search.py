@@ -2,6 +2,7 @@
 
 import dataclasses
 import enum
+import functools
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 
 from vrrt_jax.core.compiling import host_jit
 from vrrt_jax.core.edges import Space
@@ -159,7 +161,19 @@ def run_chunk(
 
 
 _chunk = host_jit(run_chunk)
-_chunks = host_jit(jax.vmap(run_chunk, in_axes=(None, 0, None, 0, 0, 0, None)))
+_run_chunks = jax.vmap(run_chunk, in_axes=(None, 0, None, 0, 0, 0, None))
+_chunks = host_jit(_run_chunks)
+
+
+@functools.lru_cache(maxsize=8)
+def _chunks_over(mesh: Mesh) -> Callable:
+    """``_chunks`` of a batch that is shared out to devices, of which none waits for another."""
+    all_of_it, own = PartitionSpec(), PartitionSpec(mesh.axis_names[0])
+    inputs = (all_of_it, own, all_of_it, own, own, own, all_of_it)
+    # The types of a loop's numbers are the same on all devices, which JAX cannot see.
+    return host_jit(
+        jax.shard_map(_run_chunks, mesh=mesh, in_specs=inputs, out_specs=own, check_vma=False)
+    )
 
 
 def compile_search(
@@ -187,6 +201,7 @@ def search(
     time_limit_s: float = float("inf"),
     max_capacity: int = MAX_CAPACITY,
     batched: bool = False,
+    mesh: Mesh | None = None,
     copies: int = 1,
     on_progress: Callable[[SearchState, float], Any] | None = None,
 ) -> SearchResult:
@@ -203,6 +218,7 @@ def search(
         max_capacity: a full tree gets four times the room, up to so many nodes.
         batched: goal, tree, key and termination lead with an axis of Q problems; the search ends
             when all have.
+        mesh: devices, along one axis, that share out a batch; they must divide Q.
         copies: trees that grow from the same roots at the same time, each on a thread and with a
             key of its own. They end together, when one has reached the goal or all are done, and
             become one tree. Not for batches.
@@ -211,7 +227,8 @@ def search(
     roots = int(tree.size) if copies > 1 else 0
     states = [(_initials if batched else _initial)(tree)] * copies
     keys = list(jax.random.split(key, copies)) if copies > 1 else [key]
-    advance = partial(_chunks if batched else _chunk, world, goal, policy)
+    run_chunks = _chunks if mesh is None else _chunks_over(mesh)
+    advance = partial(run_chunks if batched else _chunk, world, goal, policy)
     compile_s = _compile(advance, states[0], termination, keys[0])
     history = [_record(policy, goal, states, 0.0)]
 
