@@ -5,8 +5,7 @@ import subprocess
 import sys
 
 SCRIPT = """
-import time
-import jax, numpy as np
+import jax, jax.numpy as jnp, numpy as np
 import vrrt_jax
 
 devices = jax.devices()
@@ -25,19 +24,28 @@ for i, (single, shared) in enumerate(zip(one, four, strict=True)):
     assert shared.tree.q.devices() == {devices[i % 4]}, shared.tree.q.devices()
     np.testing.assert_array_equal(single.tree.q, shared.tree.q)
     np.testing.assert_array_equal(single.path, shared.path)
-print("joint goals", time.process_time())
+print("joint goals")
 
-config = vrrt_jax.PlannerConfig().changed(
-    {"budget.max_iterations": 3, "polish.hypotheses": 0, "lineages.samples": 64}
-)
-goals, starts = [problem.goal] * 3, np.stack([q, q + 0.01, q + 0.02])
+
+@vrrt_jax.pytree
+class NearGoal(vrrt_jax.LeastSquaresGoal):  # known by its loss, and quick to compile
+    q: jax.Array
+    threshold: jax.Array
+
+    def residual(self, world, q):
+        return q - self.q
+
+
+goals = [NearGoal(q=jnp.asarray(goal.q), threshold=jnp.float32(1e-4)) for goal in goals[:3]]
+starts = np.stack([q, q + 0.01, q + 0.02])
+config = vrrt_jax.PlannerConfig().changed({"budget.max_iterations": 3, "lineages.samples": 64})
 run = {"key": key, "config": config}
 one = vrrt_jax.plan_batch(robot, world, goals, starts, **run)
 four = vrrt_jax.plan_batch(robot, world, goals, starts, devices=devices[:2], **run)
 for single, shared in zip(one, four, strict=True):
     assert single.status is shared.status and single.tree.size == shared.tree.size
     np.testing.assert_allclose(single.tree.q[:80], shared.tree.q[:80], atol=1e-3)
-print("image goals", time.process_time())
+print("goals known by their loss")
 """
 
 
@@ -55,4 +63,4 @@ def test_devices_share_out_a_batch():
         env=environment,
         timeout=500,
     )
-    assert done.returncode == 0 and "image goals" in done.stdout, done.stdout + done.stderr
+    assert done.returncode == 0 and "known by their loss" in done.stdout, done.stdout + done.stderr
