@@ -1,5 +1,6 @@
 """Neural randomized planning in JAX: learned samplers for long-horizon motion in homes."""
 
+from nrp_jax.batch import plan_batch
 from nrp_jax.config import PlannerConfig
 from nrp_jax.homes.grid import Grid, load_map
 from nrp_jax.planner import plan
@@ -29,6 +30,7 @@ __all__ = [
     "load_sampler",
     "nearest_free",
     "plan",
+    "plan_batch",
     "view",
     "with_grid",
 ]

@@ -105,9 +105,8 @@ def plan(
     planner = _planner(planner, method)
     world = build_world(robot, grid) if world is None else world
     planner = default_planner(robot, world) if planner is None else planner
-    q_start = check_configuration(robot, world, q_start, "start")
     goal = q_goal if isinstance(q_goal, ConfigurationGoal) else ConfigurationGoal(q=q_goal)
-    q_goal = check_configuration(robot, world, goal.q, "goal")
+    q_start, q_goal = check_inputs(robot, world, q_start, goal.q)
     # All that follows is in the planners' own world.
     world, corner = working_world(world, goal)
     places = _Places(grid=grid, corner=corner, start=q_start)
@@ -172,6 +171,20 @@ def plan(
         rejected=dict(rejected),
     )
     return _moved(result, places)
+
+
+def check_inputs(
+    robot: MobileRobot, world: GridWorld, q_start: np.ndarray, q_goal: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Start and goal (D,), if both make sense.
+
+    Raises:
+        ValueError: one does not.
+    """
+    return (
+        check_configuration(robot, world, q_start, "start"),
+        check_configuration(robot, world, q_goal, "goal"),
+    )
 
 
 def _searched(

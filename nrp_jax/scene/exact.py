@@ -14,6 +14,7 @@ from nrp_jax.homes.grid import Grid
 from nrp_jax.scene.robots import MobileRobot
 from vrrt_jax.core.result import Verification
 from vrrt_jax.scene.advance import NEAR, Near, first_touch, near_pairs
+from vrrt_jax.scene.exact import COMPILING
 from vrrt_jax.scene.exact_slots import lever_arms
 
 STEP = 0.02  # [m] and [rad], largest distance between configurations of a trajectory, by joint
@@ -52,7 +53,8 @@ class ExactScene:
             )
         for geom in spec.geoms:
             geom.margin = NEAR / 2  # contacts are reported from afar; those of a pair add up
-        self.model = spec.compile()
+        with COMPILING:
+            self.model = spec.compile()
         self.lever_arms = lever_arms(self.model)  # (D, nbody, nbody)
         self._own = threading.local()
 

@@ -31,7 +31,7 @@ from vrrt_jax.scene.world import World, obstacle_list
 _GEOMETRIES = ("auto", "meshes", "spheres")
 _FRAME_TOLERANCE = 1e-3  # [m] between the body frames of meshes and of spheres at home
 _KEPT = 8  # compiled scenes that a thread keeps, the latest ones
-_COMPILING = threading.Lock()  # MuJoCo's compiler is for one thread at a time
+COMPILING = threading.Lock()  # MuJoCo's compiler is for one thread at a time
 _OWN = threading.local()  # what a thread keeps goes with it
 _INSTALL_ADVICE = "install the version of the meshes that the README names"
 
@@ -265,7 +265,7 @@ def _compiled(key: _Key) -> _Compiled:
     """This thread's scene: MuJoCo's data is for one thread, and so are obstacles in the model."""
     kept: OrderedDict[_Key, _Compiled] = vars(_OWN).setdefault("kept", OrderedDict())
     if key not in kept:
-        with _COMPILING:
+        with COMPILING:
             shared = _build(*key)
             model = copy.copy(shared.model)
         kept[key] = dataclasses.replace(shared, model=model, data=mujoco.MjData(model))
