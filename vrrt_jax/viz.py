@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from vrrt_jax.core.edges import difference
 from vrrt_jax.core.result import PlanResult
@@ -171,8 +171,11 @@ def save_animation(
     painter = ScenePainter(problem.robot, problem.world, problem.self_model, camera)
     goal = over_sky(problem.goal_images[0], (camera.width, camera.height))
     separator = np.full((camera.height, 4, 3), 255, np.uint8)
+    goal = _captioned(goal, "goal image")
     pictures = [
-        Image.fromarray(np.concatenate([painter.paint(q), separator, goal], axis=1))
+        Image.fromarray(
+            np.concatenate([_captioned(painter.paint(q), "path"), separator, goal], axis=1)
+        )
         for q in along(problem.world, result.path, frames)
     ]
     # The first and the last picture stay longer [ms].
@@ -181,6 +184,15 @@ def save_animation(
         path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=True
     )
     return painter.uses_meshes
+
+
+def _captioned(picture: np.ndarray, words: str) -> np.ndarray:
+    """A picture (H, W, 3) uint8 with words in its upper left corner."""
+    image = Image.fromarray(picture)
+    ImageDraw.Draw(image).text(
+        (8, 6), words, fill="black", font_size=18, stroke_fill="white", stroke_width=2
+    )
+    return np.asarray(image)
 
 
 def over_sky(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
