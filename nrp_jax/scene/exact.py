@@ -13,7 +13,7 @@ import numpy as np
 from nrp_jax.homes.grid import Grid
 from nrp_jax.scene.robots import MobileRobot
 from vrrt_jax.core.result import Verification
-from vrrt_jax.scene.advance import NEAR, Near, first_touch, near_pairs
+from vrrt_jax.scene.advance import NEAR, Near, first_touch, measure_rightly, near_pairs
 from vrrt_jax.scene.exact_slots import lever_arms
 
 STEP = 0.02  # [m] and [rad], largest distance between configurations of a trajectory, by joint
@@ -53,6 +53,7 @@ class ExactScene:
         for geom in spec.geoms:
             geom.margin = NEAR / 2  # contacts are reported from afar; those of a pair add up
         self.model = spec.compile()
+        measure_rightly(self.model)
         self.lever_arms = lever_arms(self.model)  # (D, nbody, nbody)
         self._own = threading.local()
 

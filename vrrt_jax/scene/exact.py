@@ -13,7 +13,7 @@ import numpy as np
 from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.advance import NEAR, Near, near_pairs
+from vrrt_jax.scene.advance import NEAR, Near, measure_rightly, near_pairs
 from vrrt_jax.scene.exact_held import HELD_BITS, add_held, allowed_depths
 from vrrt_jax.scene.exact_slots import (
     ALL_BITS,
@@ -307,6 +307,7 @@ def _build(
     model.geom_margin[:] = NEAR / 2
     model.pair_margin[:] = NEAR
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+    measure_rightly(model)
     # Which geoms are measured against obstacles for the clearance.
     sees_obstacles = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     if not has_meshes:
