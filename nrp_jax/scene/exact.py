@@ -13,7 +13,8 @@ import numpy as np
 from nrp_jax.homes.grid import Grid
 from nrp_jax.scene.robots import MobileRobot
 from vrrt_jax.core.result import Verification
-from vrrt_jax.scene.advance import NEAR, Near, first_touch, measure_rightly, near_pairs
+from vrrt_jax.scene.advance import NEAR, Near, first_touch, near_pairs
+from vrrt_jax.scene.exact_pairs import boxes_to_meshes, measure_rightly
 from vrrt_jax.scene.exact_slots import lever_arms
 
 STEP = 0.02  # [m] and [rad], largest distance between configurations of a trajectory, by joint
@@ -32,6 +33,7 @@ class ExactScene:
     def __init__(self, robot: MobileRobot, grid: Grid):
         """Compile the scene; the snake sees the planar map."""
         spec = mujoco.MjSpec.from_string(robot.xml)
+        boxes_to_meshes(spec)
         if robot.planar:
             grid = grid.flatten()
         self.robot = robot

@@ -4,6 +4,8 @@ Nothing of the package's exact check is used: no slots, no distances that vouch 
 boxes. Models are compiled anew, with what stands around fixed to the world.
 """
 
+import itertools
+
 import mujoco
 import numpy as np
 
@@ -30,8 +32,13 @@ class PlainScene:
 
     def __init__(self, spec: mujoco.MjSpec, corner=(0.0, 0.0)):
         """Compile it; ``corner`` (2,) is subtracted from the first two joints."""
-        for geom in spec.geoms:
+        for k, geom in enumerate(spec.geoms):
             geom.margin = NEAR / 2
+            # Of two boxes MuJoCo knows no distance; of a box and a mesh of its corners it does.
+            if geom.type == mujoco.mjtGeom.mjGEOM_BOX and geom.parent != spec.worldbody:
+                half = np.array(geom.size) * np.array(list(itertools.product((-1, 1), repeat=3)))
+                spec.add_mesh(name=f"corners {k}", uservert=half.ravel())
+                geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, f"corners {k}"
         spec.memory = 1 << 23
         self.model = spec.compile()
         # The contacts that MuJoCo adds to the right one are off by millimeters.

@@ -12,21 +12,12 @@ _NOTHING = np.zeros(0), np.zeros((0, 2), int)
 Near = tuple[np.ndarray, np.ndarray]  # distances (c,) [m] and pairs of bodies (c, 2)
 
 
-def measure_rightly(model: mujoco.MjModel) -> None:
-    """Let MuJoCo tell one contact of two convex shapes: their distance, which is right.
-
-    Those that it adds by default, for boxes and meshes that rest on each other, are wrong by
-    millimeters, and take the place of the right one, where shapes are seen from afar.
-    """
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
-
-
 def near_pairs(model: mujoco.MjModel, data: mujoco.MjData, q: np.ndarray) -> Near:
     """Distances and bodies of the pairs that are nearer than the margins of their geoms.
 
     Args:
-        model: whose geoms have the margin ``NEAR / 2``; MuJoCo adds up the two of a pair. It
-            measures rightly, see :func:`measure_rightly`.
+        model: whose geoms have the margin ``NEAR / 2``; MuJoCo adds up the two of a pair. How far
+            apart shapes are has to be right, see :mod:`vrrt_jax.scene.exact_pairs`.
         data: to compute in.
         q: (D,); negative distances are penetrations.
     """
