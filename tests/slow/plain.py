@@ -76,10 +76,11 @@ class PlainScene:
         smallest = min(d.min() for d in self.distances(path[:1]))
         for q, turn in zip(path[:-1], np.diff(path, axis=0), strict=True):
             count = max(1, int(np.ceil(np.linalg.norm(turn) / step)))
-            coarse = q + np.arange(count + 1)[:, None] / count * turn
-            nearest = np.minimum(*self.distances(coarse))
-            finer = np.arange(-FINER // 2, FINER // 2 + 1)[:, None] / (FINER * count) * turn
-            near = (coarse[nearest < NEAR][:, None] + finer).reshape(-1, path.shape[1])
+            coarse = np.arange(count + 1) / count
+            nearest = np.minimum(*self.distances(q + coarse[:, None] * turn))
+            finer = np.arange(-FINER // 2, FINER // 2 + 1) / (FINER * count)
+            near = np.clip(coarse[nearest < NEAR][:, None] + finer, 0, 1).ravel()
+            near = q + np.unique(near)[:, None] * turn
             smallest = min(smallest, *(d.min(initial=NEAR) for d in self.distances(near)))
         return -smallest
 
@@ -104,7 +105,7 @@ def plain_arm(robot: Robot, obstacles: list[Obstacle]) -> PlainScene:
 
 
 def plain_home(robot: MobileRobot, grid: Grid) -> PlainScene:
-    """A mobile robot in a home: a box for every run of solid cells, and a wide ring of walls."""
+    """A mobile robot in a home: boxes of runs of solid cells, and a wide ring of walls."""
     spec = mujoco.MjSpec.from_string(robot.xml)
     solid, cell = np.asarray(grid.occupied, bool), grid.resolution
     bottom = grid.origin[2]
@@ -113,19 +114,21 @@ def plain_home(robot: MobileRobot, grid: Grid) -> PlainScene:
         low = np.arange(solid.shape[2]) * cell + bottom
         layers = (low < 1.0 - 1e-6) & (low + cell > 1e-6)
         solid = solid[:, :, layers].any(axis=2, keepdims=True)
-    padded = np.pad(solid, [(0, 0), (1, 1), (0, 0)]).astype(np.int8)
+    padded = np.pad(solid, [(0, 1), (1, 1), (0, 0)]).astype(np.int8)
     change = np.diff(padded, axis=1)
-    for x in range(solid.shape[0]):
-        for z in range(solid.shape[2]):
+    for z in range(solid.shape[2]):
+        begun: dict[tuple[int, int], int] = {}  # where runs along y, alike in x, have begun
+        for x in range(solid.shape[0] + 1):
             column = change[x, :, z]
-            for first, last in zip(
-                np.flatnonzero(column == 1), np.flatnonzero(column == -1), strict=True
-            ):
-                low = np.array([x * cell, first * cell, bottom + z * cell])
-                high = np.array([(x + 1) * cell, last * cell, bottom + (z + 1) * cell])
+            ends = np.flatnonzero(column == 1), np.flatnonzero(column == -1)
+            runs = set(zip(*(end.tolist() for end in ends), strict=True))
+            for first, last in begun.keys() - runs:
+                low = np.array([begun[first, last] * cell, first * cell, bottom + z * cell])
+                high = np.array([x * cell, last * cell, bottom + (z + 1) * cell])
                 if robot.planar:
                     low[2], high[2] = -1.0, 1.0
                 _add_box(spec, low, high)
+            begun = {run: begun.get(run, x) for run in runs}
     wide, deep = solid.shape[0] * cell, solid.shape[1] * cell
     for low, high in (
         ((-2, -2), (0, deep + 2)),
