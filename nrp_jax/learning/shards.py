@@ -22,6 +22,7 @@ from nrp_jax.scene.robots import load_robot
 from nrp_jax.scene.world import build_world
 from vrrt_jax.core.command import end_with_parent
 from vrrt_jax.core.files import replacing
+from vrrt_jax.core.interrupt import of_parent_alone
 
 VERSION = 6  # of rows, checks of their edges and choice of homes; other versions are refused
 ROWS = ("q_start", "q_goal", "waypoint", "optimal", "ratio", "length", "query")
@@ -111,9 +112,10 @@ def make_shards(
     )
     try:
         names = {}
-        for split, index in wanted:
-            name = shard_name(split, index)
-            names[pool.submit(make_shard, settings, split, index, out / name)] = name
+        with of_parent_alone():
+            for split, index in wanted:
+                name = shard_name(split, index)
+                names[pool.submit(make_shard, settings, split, index, out / name)] = name
         # After a failure no shard is begun, but those under way are finished and kept.
         failure = None
         for future in concurrent.futures.as_completed(names):

@@ -6,6 +6,7 @@ counted twice, and what comes out is what an undisturbed run tells.
 
 import argparse
 import shutil
+import subprocess
 import tempfile
 import time
 from collections import Counter
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.slow.commands import Command, commands, end, start
+from tests.slow.commands import Command, commands, end, start, told_file
 
 
 def fresh(folder: Path) -> Path:
@@ -23,12 +24,16 @@ def fresh(folder: Path) -> Path:
     return folder
 
 
+def last_words(folder: Path) -> str:
+    """The end of what a run told."""
+    return told_file(folder).read_text()[-300:].strip()
+
+
 def undisturbed(command: Command, folder: Path) -> float:
     """A whole run; how long it took [s]."""
     began = time.monotonic()
     run = start(command, fresh(folder))
-    _, told = run.communicate(timeout=900)
-    assert run.returncode == 0, f"{command.name} ended with {run.returncode}: {told}"
+    assert run.wait(timeout=900) == 0, last_words(folder)
     return time.monotonic() - began
 
 
@@ -53,14 +58,13 @@ def disturbed(command: Command, shared: Path, kills: int, rng: np.random.Generat
         try:
             # Nobody knows where in a run a kill comes; the last run is left alone.
             run.wait(rng.uniform(0.0, 1.05 * length) if done < kills else 900)
-        except Exception:
+        except subprocess.TimeoutExpired:
             end(run)
             done += 1
             before = kept(command, folder, before)
             continue
-        _, told = run.communicate()
-        assert run.returncode == 0, f"after {done} kills it ended with {run.returncode}: {told}"
-        noise += "Traceback" in told or "Error" in told
+        assert run.returncode == 0, f"after {done} kills: {last_words(folder)}"
+        noise += "Traceback" in (told := told_file(folder).read_text()) or "Error" in told
         before = kept(command, folder, before)
         assert command.result(folder) == expected, "the results differ from an undisturbed run's"
         assert not (left := list(folder.rglob("*.part"))), f"unfinished files are left: {left}"

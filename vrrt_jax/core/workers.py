@@ -9,6 +9,7 @@ from typing import Any
 import jax
 
 from vrrt_jax.core.command import end_with_parent
+from vrrt_jax.core.interrupt import of_parent_alone
 
 _function: list[Callable[[Any], Any]] = []  # of a worker process
 
@@ -32,7 +33,8 @@ def in_processes(function: Callable[[Any], Any], items: Sequence[Any], jobs: int
     settings = (function, cores, jax.config.jax_compilation_cache_dir)
     pool = concurrent.futures.ProcessPoolExecutor(jobs, context, _begin, settings)
     try:
-        pending = [pool.submit(_call, item) for item in items]
+        with of_parent_alone():
+            pending = [pool.submit(_call, item) for item in items]
         for finished in concurrent.futures.as_completed(pending):
             yield finished.result()
     finally:
