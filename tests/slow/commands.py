@@ -56,7 +56,12 @@ def start(command: Command, folder: Path, **options: Any) -> subprocess.Popen:
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
     return subprocess.Popen(
-        [sys.executable, "-c", _BEGIN.format(command.name.split()[0]) + command.code, *command.words(folder)],
+        [
+            sys.executable,
+            "-c",
+            _BEGIN.format(command.name.split()[0]) + command.code,
+            *command.words(folder),
+        ],
         cwd=folder.parent,
         env=os.environ | own,
         stdout=subprocess.DEVNULL,
@@ -231,4 +236,3 @@ def commands(shared: Path) -> list[Command]:
             result=lambda f: sorted((name, json.dumps(plain(row))) for name, row in _curves(f)),
         ),
     ]
-

@@ -248,9 +248,7 @@ def places(seed: int) -> Iterator[tuple[str, Callable[[], Place]]]:
             f"{name} packaged",
             lambda n=name, r=robot: arm_place(
                 n,
-                list(
-                    vrrt_jax.obstacle_list(vrrt_jax.load_world(f"{n}_{1 + seed % 6}", r))
-                ),
+                list(vrrt_jax.obstacle_list(vrrt_jax.load_world(f"{n}_{1 + seed % 6}", r))),
             ),
         )
         yield f"{name} small", lambda n=name, r=robot, g=rng: arm_place(n, small_things(r, g))

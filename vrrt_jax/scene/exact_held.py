@@ -48,7 +48,10 @@ def add_held(
         size = KINDS[kind].geom_size((1.0, 1.0, 1.0))
         shape = {"type": KINDS[kind].geom, "size": size}
         if kind == "box":
-            shape = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": box_mesh(spec, body.name, size)}
+            shape = {
+                "type": mujoco.mjtGeom.mjGEOM_MESH,
+                "meshname": box_mesh(spec, body.name, size),
+            }
         contype, conaffinity = bits
         body.add_geom(name=body.name, contype=contype, conaffinity=conaffinity, **shape)
         names.append(body.name)
