@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from vrrt_jax.core.interrupt import EXIT_INTERRUPTED, ending_soon
+from vrrt_jax.core.interrupt import EXIT_INTERRUPTED, ending_soon, is_command
 
 EXIT_SOLVED, EXIT_UNSOLVED, EXIT_BAD_INPUT = 0, 1, 2
 LARGEST = 1e9  # of numbers in lists
@@ -86,7 +86,8 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
             traceback.print_exc()
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        print(f"{name}: interrupted", file=sys.stderr)
+        if not is_command():
+            print(f"{name}: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
 
 

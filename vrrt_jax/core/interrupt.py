@@ -1,6 +1,7 @@
 """Ctrl-C as a flag, so that work already done survives it; and commands that end soon after it."""
 
 import contextlib
+import multiprocessing
 import os
 import signal
 import sys
@@ -72,10 +73,16 @@ def end_at_once_while_starting() -> None:
 
 def end_interrupted(name: str) -> None:
     """Tell the only line that a command has to say after Ctrl-C, and end without waiting."""
+    _tell(name)
+    os._exit(EXIT_INTERRUPTED)
+
+
+def _tell(name: str) -> None:
     if _telling.acquire(blocking=False):
         print(f"{name}: interrupted", file=sys.stderr, flush=True)
         sys.stdout.flush()
-        os._exit(EXIT_INTERRUPTED)
+    for worker in multiprocessing.active_children():
+        worker.kill()
 
 
 @contextlib.contextmanager
@@ -107,7 +114,8 @@ def ending_soon(name: str) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        end_interrupted(name)
+        _tell(name)  # and clean up, while the watch goes on
+        raise
 
 
 @contextlib.contextmanager
