@@ -9,8 +9,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from tests.slow.commands import Command, commands, start, told_file
-from tests.slow.kill import fresh, kept, undisturbed
+from .commands import Command, commands, start, told_file
+from .kill import fresh, kept, undisturbed
 
 
 def used_kib(folder: Path) -> int:

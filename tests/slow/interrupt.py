@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.slow.commands import Command, commands, end, start, told_file
-from tests.slow.kill import fresh, kept, undisturbed
+from .commands import Command, commands, end, start, told_file
+from .kill import fresh, kept, undisturbed
 
 SOON = 2.0  # [s]
 # Commands that leave nothing before they end.

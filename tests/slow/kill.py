@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.slow.commands import Command, commands, end, start, told_file
+from .commands import Command, commands, end, start, told_file
 
 
 def fresh(folder: Path) -> Path:

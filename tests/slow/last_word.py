@@ -24,12 +24,13 @@ from nrp_jax.problems import load_problem as load_home
 from nrp_jax.scene.exact import STEP, ExactScene, verify
 from nrp_jax.scene.trajectory import trajectory_of
 from nrp_jax.scene.world import batch_is_free
-from tests.slow.plain import NEAR, PlainScene, plain_arm, plain_home
 from vrrt_jax.bench.worlds import random_world
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots.robot import workspace
 from vrrt_jax.scene.advance import FINEST
 from vrrt_jax.scene.verify import contacts
+
+from .plain import NEAR, PlainScene, plain_arm, plain_home
 
 STATED = FINEST / 2  # [m] no deeper contact is missed
 ARM_STEP = 0.005  # [rad] of verify_path
