@@ -38,7 +38,9 @@ def main() -> None:
     for cores in CORES:
         seconds = makespan(times, cores, arguments.start)
         busy = times.sum() / (seconds * cores)
-        print(f"{cores:4d} cores {seconds / 60:7.1f} min  {100 * busy:3.0f} % of their time on tasks")
+        print(
+            f"{cores:4d} cores {seconds / 60:7.1f} min  {100 * busy:3.0f} % of their time on tasks"
+        )
 
 
 if __name__ == "__main__":

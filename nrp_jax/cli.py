@@ -9,6 +9,7 @@ from pathlib import Path
 from vrrt_jax.core import command
 from vrrt_jax.core.command import EXIT_SOLVED, EXIT_UNSOLVED
 from vrrt_jax.core.files import replacing
+from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.core.tree_file import nodes_of, save_nodes
 
 
@@ -97,19 +98,20 @@ def _plan(arguments: argparse.Namespace) -> int:
             )
         settings = UNCHECKED if method in CONNECT else {}
         sampler = load_sampler(robot.name, KINDS[method], arguments.model, **settings)
-    result = plan(
-        robot,
-        grid,
-        problem.q_start,
-        problem.q_goal,
-        key=jax.random.key(arguments.seed),
-        planner=method,
-        sampler=sampler,
-        world=world,
-        max_expansions=arguments.max_expansions,
-        capacity=arguments.capacity,
-        time_limit_s=arguments.time_limit,
-    )
+    with interruptible() as interrupted:
+        result = plan(
+            robot,
+            grid,
+            problem.q_start,
+            problem.q_goal,
+            key=jax.random.key(arguments.seed),
+            planner=method,
+            sampler=sampler,
+            world=world,
+            max_expansions=arguments.max_expansions,
+            capacity=arguments.capacity,
+            time_limit_s=arguments.time_limit,
+        )
     print(result)
     out, record = Path(arguments.out), _record(problem, method, arguments.seed, result)
     with command.or_printed(lambda: json.dumps(record)), replacing(out / "path.json", "w") as file:
@@ -117,6 +119,8 @@ def _plan(arguments: argparse.Namespace) -> int:
         # What nrp view shows beside it.
         problem.grid.save(out / "map.npz")
         save_nodes(nodes_of(result.tree), out / "tree.npz")
+    if interrupted.is_set():
+        raise KeyboardInterrupt
     if not arguments.no_pictures:
         from nrp_jax.viz import save_plan
 

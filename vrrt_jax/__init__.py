@@ -2,8 +2,10 @@
 
 __version__ = "0.2.0"
 
+from vrrt_jax.core.interrupt import end_at_once_while_starting as _end_at_once_while_starting
 from vrrt_jax.gl import choose_backend as _choose_backend
 
+_end_at_once_while_starting()  # what follows takes seconds
 _choose_backend()  # before anything imports MuJoCo
 
 from vrrt_jax.config import (  # noqa: E402

@@ -10,6 +10,7 @@ from typing import Any
 from vrrt_jax.bench.commands import add_bench, add_robot
 from vrrt_jax.core import command
 from vrrt_jax.core.command import EXIT_SOLVED, EXIT_UNSOLVED
+from vrrt_jax.core.interrupt import interruptible
 from vrrt_jax.robot_commands import add_robot_commands
 
 LARGEST_SIDE = 8192  # of an image that is drawn [px]
@@ -136,20 +137,23 @@ def _plan(arguments: argparse.Namespace) -> int:
             best, nodes = float(state.tree.score.min()), int(state.tree.size)
             bar.set_postfix_str(f"best loss {best:.2e}, {nodes} nodes")
 
-        result = vrrt_jax.plan(
-            problem.robot,
-            problem.world,
-            problem.goal,
-            problem.q_start,
-            key=jax.random.key(arguments.seed),
-            config=config,
-            on_progress=on_progress,
-        )
+        with interruptible() as interrupted:
+            result = vrrt_jax.plan(
+                problem.robot,
+                problem.world,
+                problem.goal,
+                problem.q_start,
+                key=jax.random.key(arguments.seed),
+                config=config,
+                on_progress=on_progress,
+            )
     print(result)
     if problem.true_goal is not None:
         print(_off_by(problem, result))
     with command.or_printed(lambda: f"path: {json.dumps(result.path.tolist())}"):
         report.save_result(problem, result, config, arguments.seed, out)
+    if interrupted.is_set():
+        raise KeyboardInterrupt
     if limits is not None and result.ok:
         timed = vrrt_jax.time_parameterize(problem.robot, result, problem.world, limits=limits)
         vrrt_jax.save_trajectory(timed, arguments.trajectory)

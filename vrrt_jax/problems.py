@@ -12,7 +12,7 @@ from PIL import Image
 from vrrt_jax.checks import check_limits
 from vrrt_jax.core.data_file import read_json
 from vrrt_jax.core.fields import check_fields
-from vrrt_jax.core.files import replacing
+from vrrt_jax.core.files import replacing, write_text
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots import Robot, load_robot, robot_names, scenes_dir
 from vrrt_jax.robots.robot_folder import SELF_MODEL
@@ -111,7 +111,7 @@ def save_problem(problem: Problem, folder: Path) -> None:
             f"the robot holds {held}, which a problem's folder has no place for; detach them first"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "robot.xml").write_text(problem.robot.xml)
+    write_text(folder / "robot.xml", problem.robot.xml)
     write_obstacles(obstacle_list(problem.world), folder / "world.xml")
     save_self_model(problem.self_model, folder / "self_model.npz")
     views = []

@@ -7,6 +7,7 @@ from typing import Any
 from vrrt_jax.bench.commands import add_robot
 from vrrt_jax.core import command
 from vrrt_jax.core.command import EXIT_SOLVED
+from vrrt_jax.core.files import write_text
 
 
 def add_robot_commands(commands: Any) -> None:
@@ -116,7 +117,7 @@ def _spheres(arguments: argparse.Namespace) -> int:
         )
         if arguments.into is not None:
             text = replace_spheres(Path(arguments.into).read_text(), text)
-        Path(arguments.out).write_text(text)
+        write_text(Path(arguments.out), text)
         print(f"wrote {arguments.out}")
         robot = load_robot(arguments.out)
     scenes = [load_obstacles(path) for path in arguments.worlds or ()]

@@ -19,6 +19,7 @@ from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.robots import MobileRobot, load_robot
 from nrp_jax.scene.world import batch_is_free, build_world
 from vrrt_jax.core import command
+from vrrt_jax.core.files import write_text
 from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.timing import best_ms, machine
 from vrrt_jax.robots.kinematics import batch_link_poses
@@ -263,7 +264,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
         print(json.dumps(results[name], indent=1))
     results["machine"] = machine()
     if arguments.json:
-        Path(arguments.json).write_text(json.dumps(results, indent=1) + "\n")
+        write_text(Path(arguments.json), json.dumps(results, indent=1) + "\n")
     return 0
 
 

@@ -20,6 +20,7 @@ from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.robots import MobileRobot, load_robot
 from nrp_jax.scene.world import GridWorld, build_world
 from vrrt_jax.core import command
+from vrrt_jax.core.files import write_text
 from vrrt_jax.core.interrupt import uninterrupted
 from vrrt_jax.core.timing import machine
 
@@ -192,5 +193,5 @@ def _run_command(arguments: argparse.Namespace) -> int:
         "machine": machine(),
     }
     if arguments.json:
-        Path(arguments.json).write_text(json.dumps(report, indent=1) + "\n")
+        write_text(Path(arguments.json), json.dumps(report, indent=1) + "\n")
     return 0

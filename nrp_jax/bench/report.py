@@ -9,6 +9,7 @@ from typing import Any
 from nrp_jax.bench import paper
 from nrp_jax.bench.curve_table import to_text
 from vrrt_jax.core import command
+from vrrt_jax.core.files import write_text
 from vrrt_jax.core.markdown import table
 
 # What is drawn over what, and how the axes are called.
@@ -54,7 +55,7 @@ def write_page(files: Sequence[Path], folder: Path) -> Path:
             "",
         ]
     page = folder / "README.md"
-    page.write_text("\n".join(parts))
+    write_text(page, "\n".join(parts))
     return page
 
 

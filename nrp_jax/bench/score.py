@@ -28,6 +28,7 @@ from nrp_jax.learning.shards import VERSION, home_seed
 from nrp_jax.scene.robots import MobileRobot, load_robot
 from nrp_jax.scene.world import GridWorld, build_world
 from vrrt_jax.core import command
+from vrrt_jax.core.files import write_text
 from vrrt_jax.core.timing import machine
 
 LANES = 32  # waypoints proposed at a time, as a planner asks for them
@@ -194,7 +195,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
     text = json.dumps(figures, indent=2)
     print(text)
     if arguments.json:
-        Path(arguments.json).write_text(text + "\n")
+        write_text(Path(arguments.json), text + "\n")
     return 0
 
 

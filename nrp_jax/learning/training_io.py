@@ -1,8 +1,13 @@
 """Files that training writes: checkpoints to continue from, a log, and curves."""
 
+import contextlib
 import csv
+import errno
 import json
+import logging
+import os
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -72,12 +77,33 @@ class CheckpointStore:
         self._saved = time.monotonic()
         arrays = ocp.args.StandardSave({"state": _plain(state), "best": best})
         arguments = ocp.args.Composite(arrays=arrays, history=ocp.args.JsonSave(cast(Any, history)))
-        self._manager.save(len(history), args=arguments)
-        self._manager.wait_until_finished()
+        with _told_if_full(Path(self._manager.directory)):
+            self._manager.save(len(history), args=arguments)
+            self._manager.wait_until_finished()
 
     def close(self) -> None:
         """Finish writing and close the folder."""
         self._manager.close()
+
+
+@contextlib.contextmanager
+def _told_if_full(folder: Path) -> Iterator[None]:
+    """Orbax logs pages of what goes wrong, and raises it as all kinds of errors.
+
+    Raises:
+        OSError: there is no room on the disk.
+    """
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    except Exception as error:
+        for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            if os.strerror(number) in str(error):
+                kept = "the epoch before is kept, and the same command goes on with it"
+                raise OSError(number, f"{os.strerror(number)}; {kept}", str(folder)) from None
+        raise
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 def _plain(state: State) -> list[jax.Array]:

@@ -15,6 +15,7 @@ from nrp_jax.scene.robots import MobileRobot
 from vrrt_jax.core.result import Verification
 from vrrt_jax.scene.advance import NEAR, Near, first_touch, near_pairs
 from vrrt_jax.scene.exact import COMPILING
+from vrrt_jax.scene.exact_pairs import boxes_to_meshes, measure_rightly
 from vrrt_jax.scene.exact_slots import lever_arms
 
 STEP = 0.02  # [m] and [rad], largest distance between configurations of a trajectory, by joint
@@ -33,6 +34,7 @@ class ExactScene:
     def __init__(self, robot: MobileRobot, grid: Grid):
         """Compile the scene; the snake sees the planar map."""
         spec = mujoco.MjSpec.from_string(robot.xml)
+        boxes_to_meshes(spec)
         if robot.planar:
             grid = grid.flatten()
         self.robot = robot
@@ -55,6 +57,7 @@ class ExactScene:
             geom.margin = NEAR / 2  # contacts are reported from afar; those of a pair add up
         with COMPILING:
             self.model = spec.compile()
+        measure_rightly(self.model)
         self.lever_arms = lever_arms(self.model)  # (D, nbody, nbody)
         self._own = threading.local()
 

@@ -3,6 +3,8 @@
 import json
 import signal
 import types
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -135,8 +137,23 @@ def test_waypoints_lead_through_the_door(solve):
 
 
 def test_same_key_same_plan(solve):
-    first, second = solve("rrt-connect", 3), solve("rrt-connect", 3)
+    """Also on several threads at once, which plan something else meanwhile."""
+    first = solve("rrt-connect", 3)
+    with ThreadPoolExecutor(3) as pool:
+        plans = list(pool.map(partial(solve, "rrt-connect"), [3, 4, 3, 5, 3]))
+    for other in plans[::2]:
+        np.testing.assert_array_equal(first.path, other.path)
+        np.testing.assert_array_equal(first.tree.q, other.tree.q)
+    assert not np.array_equal(first.path, plans[1].path)
+
+
+def test_a_budget_of_expansions_does_not_ask_the_clock(solve):
+    """Planners that improve their paths end with it, if time is not up before."""
+    budget = {"max_expansions": 640, "time_limit_s": 1e6}
+    first, second = solve("bit-star", 3, **budget), solve("bit-star", 3, **budget)
     np.testing.assert_array_equal(first.path, second.path)
+    np.testing.assert_array_equal(first.tree.cost, second.tree.cost)
+    assert first.expansions == second.expansions
 
 
 def test_budget_and_capacity(solve):

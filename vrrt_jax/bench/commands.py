@@ -7,6 +7,7 @@ from typing import Any
 
 from vrrt_jax.core import command, workers
 from vrrt_jax.core.command import EXIT_SOLVED
+from vrrt_jax.core.files import write_text
 
 
 def add_bench(kinds: Any) -> None:
@@ -208,7 +209,7 @@ def _figures(figures: dict[str, Any], arguments: argparse.Namespace) -> int:
     text = json.dumps(figures, indent=2)
     print(text)
     if arguments.json:
-        Path(arguments.json).write_text(text + "\n")
+        write_text(Path(arguments.json), text + "\n")
     return EXIT_SOLVED
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from vrrt_jax.bench.methods import CAUSES, METHODS
 from vrrt_jax.bench.tasks import ROBOTS
+from vrrt_jax.core.files import write_text
 from vrrt_jax.core.markdown import table
 
 # Average success over the five levels [%]; Visual-RRT (CVPR 2026), on an RTX 4090.
@@ -100,7 +101,7 @@ def write_page(files: Sequence[Path], folder: Path) -> Path:
             _figure(group, folder / name)
             parts += [f"![success, causes, times and path lengths]({name})", ""]
     page = folder / "README.md"
-    page.write_text("\n".join(parts))
+    write_text(page, "\n".join(parts))
     return page
 
 

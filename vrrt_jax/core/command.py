@@ -14,7 +14,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-EXIT_SOLVED, EXIT_UNSOLVED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
+from vrrt_jax.core.interrupt import EXIT_INTERRUPTED, ending_soon, is_command
+
+EXIT_SOLVED, EXIT_UNSOLVED, EXIT_BAD_INPUT = 0, 1, 2
 LARGEST = 1e9  # of numbers in lists
 _LONGEST = 600  # characters of a message
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -61,6 +63,8 @@ class _Defaults(argparse.ArgumentDefaultsHelpFormatter):
 def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> int:
     """Run what the chosen sub-command has set as ``run``; what goes wrong becomes one line.
 
+    After Ctrl-C a command ends within two seconds.
+
     ``VRRT_TRACEBACK=1`` shows where it happened too.
 
     Returns:
@@ -72,16 +76,18 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
         return int(ended.code or 0)
     name = f"{parser.prog} {arguments.command}"
     try:
-        _check_outputs(arguments)
-        _set_up_jax(parser.prog)
-        return arguments.run(arguments)
+        with ending_soon(name):
+            _check_outputs(arguments)
+            _set_up_jax(parser.prog)
+            return arguments.run(arguments)
     except Exception as error:
         print(f"{name}: {in_one_line(error)}", file=sys.stderr)
         if os.environ.get("VRRT_TRACEBACK"):
             traceback.print_exc()
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        print(f"{name}: interrupted", file=sys.stderr)
+        if not is_command():
+            print(f"{name}: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
 
 

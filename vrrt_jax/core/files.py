@@ -24,3 +24,9 @@ def replacing(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, see :func:`replacing`."""
+    with replacing(path, "w") as file:
+        file.write(text)

@@ -1,9 +1,19 @@
-"""Ctrl-C as a flag, so that work already done survives it."""
+"""Ctrl-C as a flag, so that work already done survives it; and commands that end soon after it."""
 
 import contextlib
+import multiprocessing
+import os
 import signal
+import sys
 import threading
+import time
 from collections.abc import Iterator
+from pathlib import Path
+
+EXIT_INTERRUPTED = 130
+GRACE = 1.5  # [s] that a command may take to end by itself after Ctrl-C
+_COMMANDS = ("vrrt", "nrp")
+_telling = threading.Lock()  # taken by the one that tells
 
 
 @contextlib.contextmanager
@@ -44,3 +54,75 @@ def interruptible() -> Iterator[threading.Event]:
     finally:
         _interrupted.clear()
         signal.signal(signal.SIGINT, previous)
+
+
+def is_command() -> bool:
+    """Whether this process is one of the commands, not a program that calls them."""
+    name = Path(sys.argv[0]).name if sys.argv else ""
+    return name in _COMMANDS and threading.current_thread() is threading.main_thread()
+
+
+def end_at_once_while_starting() -> None:
+    """While a command imports its modules, Ctrl-C ends it, with one line.
+
+    An exception in the middle of that may be lost, as others look for errors of their own there.
+    """
+    if is_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, lambda *_: end_interrupted(Path(sys.argv[0]).name))
+
+
+def end_interrupted(name: str) -> None:
+    """Tell the only line that a command has to say after Ctrl-C, and end without waiting."""
+    _tell(name)
+    os._exit(EXIT_INTERRUPTED)
+
+
+def _tell(name: str) -> None:
+    if _telling.acquire(blocking=False):
+        print(f"{name}: interrupted", file=sys.stderr, flush=True)
+        sys.stdout.flush()
+    for worker in multiprocessing.active_children():
+        worker.kill()
+
+
+@contextlib.contextmanager
+def ending_soon(name: str) -> Iterator[None]:
+    """A command that gets Ctrl-C has ``GRACE`` to end; then it ends wherever it is.
+
+    A compiler or a simulator may run for long before Python hears of a signal, and an exception
+    may be lost. Files are whole at any time, see :mod:`vrrt_jax.core.files`, so that what was done
+    is kept.
+
+    Args:
+        name: of the command.
+    """
+    if not is_command():
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    heard, told = os.pipe()
+    os.set_blocking(told, False)
+    signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+
+    def watch() -> None:
+        while os.read(heard, 1)[0] != signal.SIGINT:
+            pass
+        time.sleep(GRACE)
+        end_interrupted(name)
+
+    threading.Thread(target=watch, daemon=True).start()
+    try:
+        yield
+    except KeyboardInterrupt:
+        _tell(name)  # and clean up, while the watch goes on
+        raise
+
+
+@contextlib.contextmanager
+def of_parent_alone() -> Iterator[None]:
+    """Processes that are begun meanwhile hear no Ctrl-C: their parent does, and ends them."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)

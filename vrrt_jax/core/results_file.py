@@ -100,10 +100,8 @@ def write(file: Path, results: Mapping[str, Any]) -> None:
         with replacing(file, "w") as handle:
             handle.write(json.dumps(results, indent=1) + "\n")
     except OSError as error:
-        raise OSError(
-            f"cannot write '{file}': {error.strerror}; what it held is kept, and the same command "
-            "goes on from there"
-        ) from None
+        kept = "what it held is kept, and the same command goes on from there"
+        raise OSError(error.errno, f"{error.strerror}; {kept}", str(file)) from None
 
 
 def fingerprint(file: Path) -> str:

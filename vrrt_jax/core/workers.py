@@ -12,6 +12,7 @@ import jax
 from vrrt_jax.core import command
 from vrrt_jax.core.cluster import on_cluster
 from vrrt_jax.core.command import end_with_parent
+from vrrt_jax.core.interrupt import of_parent_alone
 
 _function: list[Callable[[Any], Any]] = []  # of a worker process
 
@@ -44,7 +45,8 @@ def in_workers(
     pool = concurrent.futures.ProcessPoolExecutor(jobs, context, _begin, settings)
     failure = None
     try:
-        pending = [pool.submit(_call, item) for item in items]
+        with of_parent_alone():
+            pending = [pool.submit(_call, item) for item in items]
         for finished in concurrent.futures.as_completed(pending):
             if finished.cancelled():
                 continue

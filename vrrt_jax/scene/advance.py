@@ -16,7 +16,8 @@ def near_pairs(model: mujoco.MjModel, data: mujoco.MjData, q: np.ndarray) -> Nea
     """Distances and bodies of the pairs that are nearer than the margins of their geoms.
 
     Args:
-        model: whose geoms have the margin ``NEAR / 2``; MuJoCo adds up the two of a pair.
+        model: whose geoms have the margin ``NEAR / 2``; MuJoCo adds up the two of a pair. How far
+            apart shapes are has to be right, see :mod:`vrrt_jax.scene.exact_pairs`.
         data: to compute in.
         q: (D,); negative distances are penetrations.
     """

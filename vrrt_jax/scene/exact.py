@@ -15,6 +15,7 @@ from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.advance import NEAR, Near, near_pairs
 from vrrt_jax.scene.exact_held import HELD_BITS, add_held, allowed_depths
+from vrrt_jax.scene.exact_pairs import boxes_to_meshes, measure_rightly
 from vrrt_jax.scene.exact_slots import (
     ALL_BITS,
     add_slots,
@@ -296,6 +297,7 @@ def _build(
     if has_meshes:
         _check_same_robot(robot, spec.copy().compile(), spheres.compile())
         _exclude(spec, robot.ignored_pairs)
+        boxes_to_meshes(spec)
     held_names = add_held(spec, held, HELD_BITS["meshes" if has_meshes else "spheres"])
     num_bodies = len(spec.bodies)
     # Collision spheres see bit 0 only, and self-collision spheres see no obstacle.
@@ -307,6 +309,7 @@ def _build(
     model.geom_margin[:] = NEAR / 2
     model.pair_margin[:] = NEAR
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+    measure_rightly(model)
     # Which geoms are measured against obstacles for the clearance.
     sees_obstacles = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     if not has_meshes:

@@ -7,6 +7,7 @@ import numpy as np
 
 from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.names import free_name
+from vrrt_jax.scene.exact_pairs import box_mesh
 from vrrt_jax.scene.exact_slots import ALL_BITS
 from vrrt_jax.scene.held import HeldObject
 from vrrt_jax.scene.obstacle_kinds import KINDS
@@ -45,14 +46,14 @@ def add_held(
             name=f"held: {k}", explicitinertial=True, mass=1.0, inertia=[0.01] * 3
         )
         size = KINDS[kind].geom_size((1.0, 1.0, 1.0))
+        shape = {"type": KINDS[kind].geom, "size": size}
+        if kind == "box":
+            shape = {
+                "type": mujoco.mjtGeom.mjGEOM_MESH,
+                "meshname": box_mesh(spec, body.name, np.asarray(size)),
+            }
         contype, conaffinity = bits
-        body.add_geom(
-            name=body.name,
-            type=KINDS[kind].geom,
-            size=size,
-            contype=contype,
-            conaffinity=conaffinity,
-        )
+        body.add_geom(name=body.name, contype=contype, conaffinity=conaffinity, **shape)
         names.append(body.name)
     for geom in _alone(spec) if held else ():
         geom.conaffinity |= _OWN

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import mujoco
 import numpy as np
 
+from vrrt_jax.scene.exact_pairs import resize_mesh
 from vrrt_jax.scene.obstacle_kinds import KINDS
 from vrrt_jax.scene.obstacles import Obstacle
 
@@ -81,6 +82,8 @@ def place(model: mujoco.MjModel, geom: int, obstacle: Obstacle) -> None:
     size, num_sizes = np.zeros(3), KINDS[obstacle.kind].num_sizes
     size[:num_sizes] = obstacle.size[:num_sizes]
     model.geom_size[geom] = size
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+        resize_mesh(model, int(geom), size)
     # What MuJoCo's compiler derives from the size: the box around it and its radius.
     model.geom_aabb[geom] = [0.0, 0.0, 0.0, *_half_extents(obstacle.kind, size)]
     model.geom_rbound[geom] = _radius(obstacle.kind, size)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from vrrt_jax.core.files import write_text
 from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.names import free_name
 from vrrt_jax.scene.obstacle_kinds import KINDS, SlotShape
@@ -134,7 +135,7 @@ def write_obstacles(obstacles: Sequence[Obstacle], path: Path, comment: str = ""
         numbers = {key: " ".join(f"{v:.9g}" for v in value) for key, value in fields.items()}
         ET.SubElement(body, "geom", {"name": obstacle.name, "type": obstacle.kind, **numbers})
     ET.indent(root)
-    path.write_text(ET.tostring(root, encoding="unicode") + "\n")
+    write_text(path, ET.tostring(root, encoding="unicode") + "\n")
 
 
 def to_slots(obstacles: Sequence[Obstacle], num_slots: int) -> Obstacles:

@@ -17,6 +17,7 @@ import jax
 import mujoco
 import numpy as np
 
+from vrrt_jax.core.files import write_text
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots.mesh_sources import mesh_file
 from vrrt_jax.splat.calibrate import calibrate
@@ -152,7 +153,7 @@ def _claim(work: Path, robot, seed: int, config: FitConfig) -> None:
             f"'{work}' holds an unfinished training of another robot, seed or configuration; "
             "finish that one or delete the folder"
         )
-    file.write_text(stamp)
+    write_text(file, stamp)
 
 
 def _cached_images(

@@ -89,6 +89,8 @@ def fit_robot(
     }
     if (folder / RECORD).is_file():
         record = _earlier_record(folder, made_of, sha256(path))
+        if not record.rounds and not (folder / MODEL).is_file():  # killed between the two
+            record = _begin(source, path, folder, made_of)
     else:
         _check_empty(folder)
         record = _begin(source, path, folder, made_of)

@@ -1,0 +1,94 @@
+"""Ctrl-C at random moments: a command ends within 2 s with one line, and what was done is kept.
+
+Run ``python -m tests.slow.interrupt --times 10``.
+"""
+
+import argparse
+import signal
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from .commands import Command, commands, end, start, told_file
+from .kill import fresh, kept, undisturbed
+
+SOON = 2.0  # [s]
+# Commands that leave nothing before they end.
+OTHERS = {
+    "vrrt plan": ("vrrt_jax", ["plan", "--problem", "panda_posts", "--no-pictures", "--out"]),
+    "nrp plan": (
+        "nrp_jax",
+        [*("plan", "--problem", "home_1", "--method", "bit-star", "--time-limit", "20"), "--out"],
+    ),
+    "vrrt bench search": ("vrrt_jax", ["bench", "search", "--json"]),
+    "vrrt spheres": ("vrrt_jax", ["spheres", "--robot", "panda", "--spheres", "12", "--out"]),
+}
+
+
+def others() -> list[Command]:
+    """Commands whose results are not looked at."""
+    return [
+        Command(
+            name=name,
+            code=f"from {package}.cli import main; raise SystemExit(main())",
+            words=lambda folder, words=words: [*words, str(folder / "out")],
+            done=lambda folder: [],
+            result=lambda folder: None,
+        )
+        for name, (package, words) in OTHERS.items()
+    ]
+
+
+def interrupted(command: Command, shared: Path, times: int, rng: np.random.Generator) -> str:
+    """Interrupt a command at random moments: how it ended."""
+    length = undisturbed(command, shared / "whole")
+    folder, before = fresh(shared / "interrupted"), {}
+    slowest, wrong, count = 0.0, [], 0
+    for _ in range(3 * times):
+        if count == times:
+            break
+        run = start(command, folder)
+        moment = rng.uniform(0.2, length)
+        try:
+            run.wait(moment)
+        except subprocess.TimeoutExpired:
+            code, seconds = end(run, signal.SIGINT)
+            lines = [line for line in told_file(folder).read_text().splitlines() if line.strip()]
+            lines = [line for line in lines if "\r" not in line and "it/s" not in line]
+            before = kept(command, folder, before)
+            count, slowest = count + 1, max(slowest, seconds)
+            ok = code == 130 and seconds < SOON and "interrupted" in lines[-1]
+            if not ok or any("Traceback" in line for line in lines):
+                wrong.append(f"at {moment:.1f} s: code {code}, {seconds:.1f} s, {lines[-2:]}")
+            continue
+        assert run.returncode in (0, 1), told_file(folder).read_text()[-300:]
+        folder, before = fresh(shared / "interrupted"), {}
+    return f"{count} of {length:.0f} s, slowest {slowest:.2f} s, wrong {len(wrong)} {wrong}"
+
+
+def main() -> int:
+    """Interrupt them all; ends with 1 if anything went wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--times", type=int, default=10)
+    parser.add_argument("--only", default="", help="commands whose names hold this")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--folder", help="where to work; a temporary one by default")
+    arguments = parser.parse_args()
+    failed = 0
+    with tempfile.TemporaryDirectory() as folder:
+        shared = Path(arguments.folder or folder)
+        shared.mkdir(exist_ok=True)
+        for command in [*others(), *commands(shared)]:
+            if arguments.only not in command.name:
+                continue
+            rng = np.random.default_rng(arguments.seed)
+            words = interrupted(command, shared, arguments.times, rng)
+            failed += "wrong 0" not in words
+            print(f"{command.name}: {words}", flush=True)
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
