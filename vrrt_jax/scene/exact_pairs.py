@@ -1,5 +1,7 @@
 """What C MuJoCo has to be told, or not to be asked, to measure how far apart two shapes are."""
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
@@ -7,7 +9,7 @@ _CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), -1).reshape(
 _GEOM = mujoco.mjtGeom
 
 
-def box_mesh(spec: mujoco.MjSpec, name: str, size: np.ndarray | tuple[float, ...]) -> str:
+def box_mesh(spec: mujoco.MjSpec, name: str, size: Any) -> str:
     """Add a mesh of eight corners, which is a box of this size (3,) [m]; returns its name.
 
     MuJoCo knows of two boxes whether they touch, but not how far apart they are: it may see nothing
