@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 EXIT_INTERRUPTED = 130
-GRACE = 1.5  # [s] that a command may take to end by itself after Ctrl-C
+GRACE = 1.0  # [s] that a command may take to end by itself after Ctrl-C
 _COMMANDS = ("vrrt", "nrp")
 _telling = threading.Lock()  # taken by the one that tells
 
