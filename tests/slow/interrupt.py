@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from .commands import Command, commands, end, start, told_file
-from .kill import fresh, kept, undisturbed
+from .kill import fresh, kept
 
 SOON = 2.0  # [s]
 # Commands that leave nothing before they end.
@@ -41,16 +41,17 @@ def others() -> list[Command]:
     ]
 
 
-def interrupted(command: Command, shared: Path, times: int, rng: np.random.Generator) -> str:
-    """Interrupt a command at random moments: how it ended."""
-    length = undisturbed(command, shared / "whole")
+def interrupted(
+    command: Command, shared: Path, times: int, within: float, rng: np.random.Generator
+) -> str:
+    """Interrupt a command at random moments of so many seconds: how it ended."""
     folder, before = fresh(shared / "interrupted"), {}
     slowest, wrong, count = 0.0, [], 0
     for _ in range(3 * times):
         if count == times:
             break
         run = start(command, folder)
-        moment = rng.uniform(0.2, length)
+        moment = rng.uniform(0.2, within)
         try:
             run.wait(moment)
         except subprocess.TimeoutExpired:
@@ -65,13 +66,14 @@ def interrupted(command: Command, shared: Path, times: int, rng: np.random.Gener
             continue
         assert run.returncode in (0, 1), told_file(folder).read_text()[-300:]
         folder, before = fresh(shared / "interrupted"), {}
-    return f"{count} of {length:.0f} s, slowest {slowest:.2f} s, wrong {len(wrong)} {wrong}"
+    return f"{count} interrupts, slowest {slowest:.2f} s, wrong {len(wrong)} {wrong}"
 
 
 def main() -> int:
     """Interrupt them all; ends with 1 if anything went wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--times", type=int, default=10)
+    parser.add_argument("--within", type=float, default=30.0, help="of the start [s]")
     parser.add_argument("--only", default="", help="commands whose names hold this")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", help="where to work; a temporary one by default")
@@ -84,7 +86,7 @@ def main() -> int:
             if arguments.only not in command.name:
                 continue
             rng = np.random.default_rng(arguments.seed)
-            words = interrupted(command, shared, arguments.times, rng)
+            words = interrupted(command, shared, arguments.times, arguments.within, rng)
             failed += "wrong 0" not in words
             print(f"{command.name}: {words}", flush=True)
     return int(failed > 0)

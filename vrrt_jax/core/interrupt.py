@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 EXIT_INTERRUPTED = 130
-GRACE = 1.5  # [s] that a command may take to end by itself after Ctrl-C
+GRACE = 0.8  # [s] that a command may take to end by itself after Ctrl-C
+LAST = 0.4  # [s] after that
 _COMMANDS = ("vrrt", "nrp")
 _telling = threading.Lock()  # taken by the one that tells
 
@@ -108,6 +109,8 @@ def ending_soon(name: str) -> Iterator[None]:
         while os.read(heard, 1)[0] != signal.SIGINT:
             pass
         time.sleep(GRACE)
+        _tell(name)
+        time.sleep(LAST)  # what waited for workers, which are gone now, may clean up
         end_interrupted(name)
 
     threading.Thread(target=watch, daemon=True).start()
