@@ -6,6 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from vrrt_jax.core.arrays_file import read_arrays
+from vrrt_jax.core.data_file import of_file
+
 RESOLUTION = 0.1  # side of the cells that planners and networks expect [m]
 HEIGHT = 2.0  # of the maps [m]; homes end there
 
@@ -139,13 +142,12 @@ def load_map(path: str | Path, *, crop: tuple[float, float, float, float] | None
         raise ValueError(f"map '{path}': unknown kind; expected one of {', '.join(readers)}")
     if crop is not None and (len(crop) != 4 or not np.isfinite(crop).all()):
         raise ValueError(f"crop is {crop}; expected four numbers x0, y0, x1, y1 [m]")
-    try:
-        grid = readers[path.suffix](path, crop)
-        grid = grid if crop is None else grid.crop(crop[:2], crop[2:])
-    except ValueError as error:
-        raise ValueError(f"map '{path}': {error}") from error
-    except MemoryError as error:
-        raise ValueError(f"map '{path}': too little memory; read a part of it, see crop") from error
+    with of_file(path):
+        try:
+            grid = readers[path.suffix](path, crop)
+            grid = grid if crop is None else grid.crop(crop[:2], crop[2:])
+        except MemoryError:
+            raise ValueError("too little memory; read a part of it, see crop") from None
     if np.all(grid.occupied):
         warnings.warn(
             f"map '{path}': all of its {grid.occupied.size} cells are solid; expected free ones: "
@@ -232,16 +234,8 @@ def part_of(
 
 
 def _read_npz(path: Path, crop: tuple[float, float, float, float] | None) -> Grid:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = dict(data)
-    except MemoryError:
-        raise
-    except Exception as error:  # numpy and zipfile raise many kinds
-        raise ValueError(f"it is not a readable .npz file: {error}") from error
     known = ("occupied", "resolution_m", "origin_m")
-    if "occupied" not in arrays:
-        raise ValueError(f"it has no array 'occupied', only: {', '.join(arrays)}")
+    arrays = read_arrays(path, "occupied")
     if unknown := sorted({*arrays} - {*known}):
         raise ValueError(f"it has unknown arrays {', '.join(unknown)}; expected {', '.join(known)}")
     for name, array in arrays.items():

@@ -1,5 +1,6 @@
 """What MuJoCo does not do with a URDF file: find its meshes, and mind what its limits say."""
 
+import os
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,6 +9,8 @@ from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
+
+from vrrt_jax.robots.xml_file import xml_root
 
 _PACKAGES = ("package://", "model://", "$(find ")  # before the name of a package
 _FILE = "file://"
@@ -25,11 +28,11 @@ def urdf_root(path: Path) -> ElementTree.Element | None:
     """The root of a URDF file; None for a file of another kind.
 
     Raises:
-        ValueError: it is a xacro file, which only becomes a URDF.
+        FileNotFoundError: no such file.
+        ValueError: it is a xacro file, which only becomes a URDF, or declares entities.
     """
-    try:
-        root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError:
+    root = xml_root(path)
+    if root is None:
         return None
     for element in root.iter():
         if str(element.tag).startswith(_XACRO):
@@ -69,7 +72,7 @@ def urdf_spec(root: ElementTree.Element, path: Path, *, visuals: bool) -> mujoco
             continue
         name = mesh.get("filename", "")
         places = list(_places(name, folder, compiler.get("meshdir", "")))
-        there = next((place for place in places if place.is_file()), None)
+        there = next((place for place in places if os.path.isfile(place)), None)
         if there is None:
             raise ValueError(_not_found(name, link, places))
         if there.suffix.lower() not in _READ:

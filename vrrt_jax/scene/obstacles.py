@@ -18,6 +18,7 @@ import numpy as np
 
 from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.names import free_name
+from vrrt_jax.robots.xml_file import check_mjcf
 from vrrt_jax.scene.obstacle_kinds import KINDS, SlotShape
 
 PARKED = 1e3  # [m] where the empty slots are
@@ -78,10 +79,7 @@ def load_obstacles(path: str | Path) -> list[Obstacle]:
         ValueError: not MJCF, a body that moves, or a geom of another kind.
     """
     try:
-        Path(path).read_bytes()
-    except OSError as error:
-        raise FileNotFoundError(f"cannot read the world '{path}': {error.strerror}") from None
-    try:
+        check_mjcf(path)
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise ValueError(f"'{path}' is not a valid MJCF world: {error}") from None

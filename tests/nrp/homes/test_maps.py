@@ -6,8 +6,9 @@ import pytest
 from PIL import Image
 
 import nrp_jax
-from nrp_jax.homes import memory, mjcf_map
+from nrp_jax.homes import mjcf_map
 from nrp_jax.homes.grid import coarsened, load_map
+from vrrt_jax.core import memory
 
 ROS = "image: home.png\nresolution: 0.1\norigin: [-1.0, -2.0, 0.0]\n"
 
