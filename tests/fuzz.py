@@ -14,7 +14,6 @@ import os
 import resource
 import select
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -29,7 +28,7 @@ if __name__ == "__main__":  # the packages and the inputs lie beside this file
 import numpy as np
 from fuzz_damage import damage
 
-SECONDS, SILENT_SECONDS, BYTES = 20, 180, 1 << 30  # that a command may take
+SECONDS, SILENT_SECONDS, BYTES = 30, 90, 1 << 30  # that a command may take
 WORDS = ("allow_pickle", "Traceback", "object at 0x")  # that mean nothing to users
 
 
@@ -237,25 +236,27 @@ def watched(name: str, seed: int, count: int, first: int = 0):
     while first < count:
         words = ["--command", name, "--seed", seed, "--count", count, "--first", first, "--worker"]
         worker = subprocess.Popen(
-            [sys.executable, __file__, *map(str, words)], stdout=subprocess.PIPE, text=True
+            [sys.executable, __file__, *map(str, words)], stdout=subprocess.PIPE, bufsize=0
         )
         assert worker.stdout is not None
-        begun = None
+        begun, heard = None, b""
         while select.select([worker.stdout], [], [], SILENT_SECONDS)[0]:
-            line = worker.stdout.readline()
-            if not line:
+            if not (part := worker.stdout.read(1 << 16)):
                 break
-            row = json.loads(line) if line.startswith("{") else {}
-            begun = row.get("begin", begun)
-            if "faults" in row:
-                first = row["number"] + 1
-                yield row
-        worker.send_signal(signal.SIGKILL)
-        code = worker.wait()
+            *lines, heard = (heard + part).split(b"\n")
+            for row in map(json.loads, lines):
+                begun = row.get("begin", begun)
+                if "faults" in row:
+                    first = row["number"] + 1
+                    yield row
+        code = worker.poll()
+        worker.kill()
+        worker.wait()
         if begun is None:
             raise RuntimeError(f"the worker ended with {code} before its first input")
         if first < count:
-            yield {"number": begun, "faults": [f"the process ended ({code})"], "told": ""}
+            end = "it hangs" if code is None else f"the process ended with {code}"
+            yield {"number": begun, "faults": [end], "told": ""}
             first = begun + 1
 
 

@@ -207,6 +207,7 @@ def nrp_inputs(folder: Path) -> list[tuple[str, list[str]]]:
     _dataset(data, path)
     packaged = ["plan", "--problem", "home_1", "--out", "OUT", "--method"]
     ends = [f"--{n}={','.join(map(str, problem[n]))}" for n in ("start", "goal")]
+    part = ["--map", str(maps / "map.yaml"), "--crop=-2.5,-2.5,2.8,2.8"]
     ros = ["--start=1.5,1.5,0,0,0,0,0,0", "--goal=2,1.5,0,0,0,0,0,0"]
     still = ["--out", "OUT", "--method", "rrt-connect"]
     home, rows = str(folder / "home.npz"), ["--data", str(data)]
@@ -218,7 +219,7 @@ def nrp_inputs(folder: Path) -> list[tuple[str, list[str]]]:
     return [
         ("home.npz", ["plan", "--map", home, *ends, *still]),
         ("ros", ["plan", "--map", str(maps / "map.yaml"), *ros, *still]),
-        ("ros", ["plan", "--map", str(maps / "map.yaml"), "--crop=-2.5,-2.5,2.8,2.8", *ros, *still]),
+        ("ros", ["plan", *part, *ros, *still]),
         ("room.xml", ["plan", "--map", str(folder / "room.xml"), *ros, *still]),
         ("problem", ["plan", "--problem", str(folder / "problem"), *still]),
         ("models", [*packaged, "nrp-d", "--model", str(models / "discriminator")]),

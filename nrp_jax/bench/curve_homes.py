@@ -105,6 +105,8 @@ def from_maps(
                 else _with_poses(robot, name, grid, poses, queries, legs)
             )
         except ValueError as error:
+            if len(grids) == 1:
+                raise ValueError(f"map '{name}' of '{folder}': {error}") from None
             print(f"map '{name}' is left out: {error}", file=sys.stderr)
         if len(found) == num:
             break

@@ -148,6 +148,8 @@ def load_map(path: str | Path, *, crop: tuple[float, float, float, float] | None
             grid = grid if crop is None else grid.crop(crop[:2], crop[2:])
         except MemoryError:
             raise ValueError("too little memory; read a part of it, see crop") from None
+    if crop is not None:
+        _warn_of_cut(grid, crop)
     if np.all(grid.occupied):
         warnings.warn(
             f"map '{path}': all of its {grid.occupied.size} cells are solid; expected free ones: "
@@ -155,6 +157,18 @@ def load_map(path: str | Path, *, crop: tuple[float, float, float, float] | None
             stacklevel=2,
         )
     return grid
+
+
+def _warn_of_cut(grid: Grid, crop: tuple[float, float, float, float]) -> None:
+    """Warn where the part that was read ends before the one that was asked for."""
+    low, high = grid.origin[:2], np.array(grid.origin[:2]) + grid.size[:2]
+    if np.any(low - np.array(crop[:2]) > RESOLUTION) or np.any(crop[2:] - high > RESOLUTION):
+        spans = f"{np.round(low, 3).tolist()} to {np.round(high, 3).tolist()}"
+        warnings.warn(
+            f"the crop {tuple(np.round(crop, 3).tolist())} reaches beyond the map; the part that "
+            f"is there spans {spans} m, and all around it is solid",
+            stacklevel=3,
+        )
 
 
 def coarsened(grid: Grid, resolution: float = RESOLUTION, *, cells: int | None = None) -> Grid:

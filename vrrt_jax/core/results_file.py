@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vrrt_jax.core.data_file import read_json, read_text
+from vrrt_jax.core.data_file import check_file, read_json, read_text
 from vrrt_jax.core.files import replacing
 
 
@@ -113,8 +113,12 @@ def write(file: Path, results: Mapping[str, Any]) -> None:
 
 
 def fingerprint(file: Path) -> str:
-    """Of what is in a file."""
-    return hashlib.sha256(file.read_bytes()).hexdigest()[:12]
+    """Of what is in a file.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    return hashlib.sha256(check_file(file).read_bytes()).hexdigest()[:12]
 
 
 def plain(fields: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vrrt_jax.core.data_file import read_json
+from vrrt_jax.core.data_file import check_file, read_json
 from vrrt_jax.core.fields import record_of
 from vrrt_jax.core.files import replacing
 
@@ -38,7 +38,7 @@ class Record:
 
 def sha256(file: Path) -> str:
     """A fingerprint of a file's bytes."""
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+    return hashlib.sha256(check_file(file).read_bytes()).hexdigest()
 
 
 def write_record(folder: Path, record: Record) -> None:

@@ -64,6 +64,7 @@ def urdf_spec(root: ElementTree.Element, path: Path, *, visuals: bool) -> mujoco
         if limit is not None and joint.get("type") in _LIMITED and _NAMES & set(limit.keys()):
             for name in sorted(_NAMES):
                 limit.set(name, limit.get(name, "0"))  # MuJoCo takes one alone for none at all
+    _narrow_to_soft_limits(root)
     compiler.set("discardvisual", "false" if visuals else "true")
     folder = path.resolve().parent
     packages = {_package(mesh.get("filename", "")) for _, _, mesh in _meshes(root)} - {""}
@@ -109,6 +110,46 @@ def _check_tree(root: ElementTree.Element) -> None:
             f"the links {', '.join(map(str, roots))} are children of no joint; expected one such "
             "link, the base: add the joints that carry the others"
         )
+
+
+def _narrow_to_soft_limits(root: ElementTree.Element) -> None:
+    """Put soft limits, where a controller stops the joint, in place of wider ones, in place."""
+    for joint in root.findall("joint"):
+        soft, limit = joint.find("safety_controller"), joint.find("limit")
+        if soft is None or limit is None or joint.get("type") not in _LIMITED:
+            continue
+        hard = [_limit(limit, name) for name in ("lower", "upper")]
+        ends = [_limit(soft, f"soft_{name}_limit") for name in ("lower", "upper")]
+        if not np.isfinite(ends).all():
+            raise ValueError(
+                f"joint '{joint.get('name', '')}' has the soft limits {ends} in its "
+                "safety_controller; expected two numbers, or no safety_controller"
+            )
+        low, high = max(hard[0], ends[0]), min(hard[1], ends[1])
+        if ends == [0.0, 0.0] or [low, high] == hard:  # left out, they are 0
+            continue
+        name = joint.get("name", "")
+        if not low < high:
+            raise ValueError(
+                f"joint '{name}' has the soft limits {ends} in its safety_controller, of which "
+                f"none is inside its limits {hard}; correct them, or remove the safety_controller"
+            )
+        warnings.warn(
+            f"joint '{name}' is planned within [{low:g}, {high:g}], the soft limits of its "
+            f"safety_controller, not within its limits {hard}; remove the safety_controller to "
+            "plan up to these",
+            stacklevel=7,
+        )
+        limit.set("lower", repr(low))
+        limit.set("upper", repr(high))
+
+
+def _limit(element: ElementTree.Element, name: str) -> float:
+    """A limit; 0 where it is left out, and NaN for what is no number, of which others tell."""
+    try:
+        return float(element.get(name) or 0.0)
+    except ValueError:
+        return np.nan
 
 
 def _meshes(root: ElementTree.Element) -> Iterator[tuple[str, str, ElementTree.Element]]:

@@ -68,7 +68,8 @@ def load_photo(
             fields = with_extrinsics(fields, given)
     with _of_source(camera):
         pinhole, lens = camera_and_lens(fields, pixels.shape[:2])
-    pixels = _with_mask(pixels, robot_mask, background, box)
+    with _of_source(image):
+        pixels = _with_mask(pixels, robot_mask, background, box)
     height, width = pixels.shape[:2]
     seen = np.ones((height, width), np.float32)
     if mask is not None:
