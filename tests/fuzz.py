@@ -30,6 +30,8 @@ from fuzz_damage import damage
 
 SECONDS, SILENT_SECONDS, BYTES = 30, 90, 1 << 30  # that a command may take
 WORDS = ("allow_pickle", "Traceback", "object at 0x")  # that mean nothing to users
+# What may be named in place of the damaged file, where that says where the robot should be.
+NAMED = ("--", "the start", "the goal", "configuration", "at home", "self-model")
 
 
 class Read(BaseException):
@@ -187,8 +189,8 @@ def faults(inputs: Inputs, name: str, file: Path, words: list[str]) -> tuple[lis
         found.append(f"unexpected {type(errors[-1]).__name__}")
     if said := [word for word in WORDS if word in heard]:
         found.append(f"says {said[0]!r}")
-    if code == 2 and file.stem not in heard and file.parent.name not in heard:
-        found.append("does not name the file")
+    if code == 2 and not any(name in heard for name in (file.stem, file.parent.name, *NAMED)):
+        found.append("names nothing that was given")
     found += sorted(
         {f"{w.category.__name__}" for w in warned if not issubclass(w.category, UserWarning)}
     )

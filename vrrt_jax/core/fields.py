@@ -53,11 +53,15 @@ def record_of(kind: type[Any], fields: Any, what: str) -> Any:
             continue
         values[name] = value = _as(expected, fields[name])
         if value is _OTHER:
-            told = getattr(expected, "__name__", expected) if not get_args(expected) else expected
+            told = _WORDS.get(get_origin(expected) or expected, expected)
             raise ValueError(f"{what} has {name} {fields[name]!r}; expected {told}")
     return kind(**values)
 
 
+_WORDS = {
+    **{int: "a whole number", float: "a number", bool: "true or false", str: "a text"},
+    **{tuple: "a list", Mapping: "an object"},
+}
 _OTHER = object()  # a value of another type
 
 

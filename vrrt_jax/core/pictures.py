@@ -8,7 +8,7 @@ from PIL import Image
 from vrrt_jax.core.data_file import check_file
 
 # Pillow would read others too; of EPS it runs Ghostscript.
-FORMATS = ("PNG", "JPEG", "MPO", "BMP", "GIF", "TIFF", "WEBP", "PPM", "TGA", "PCX")
+FORMATS = ("PNG", "JPEG", "BMP", "GIF", "TIFF", "WEBP", "PPM", "TGA", "PCX")
 
 
 def open_picture(path: str | Path) -> Image.Image:

@@ -58,7 +58,7 @@ def check_mjcf(path: str | Path) -> None:
             if key.startswith("file"):
                 for folder in folders:
                     _check_end(path.parent / folder / text, text)
-            _check_numbers(part.tag, key, text)
+            _check_numbers(part, key, text)
         keys, most = _COUNTS.get(part.tag, ((), 0))
         if keys and (number := math.prod(_whole(part.get(key, "")) for key in keys)) > most:
             raise ValueError(
@@ -82,6 +82,8 @@ def _parts(root: ElementTree.Element, path: Path, seen: set[str]) -> Iterator[El
         included = path.parent / part.get("file", "") if part.tag == "include" else path
         if os.path.realpath(included) not in seen:
             seen.add(os.path.realpath(included))
+            if os.path.isdir(included):
+                raise ValueError(f"it includes '{part.get('file')}', which is a folder")
             _check_end(included, part.get("file", ""))
             inner = xml_root(included) if os.path.isfile(included) else None
             stack += [] if inner is None else [(inner, copies)]
@@ -93,14 +95,15 @@ def _check_end(place: Path, name: str) -> None:
         raise ValueError(f"it names '{name}', which is no plain file; expected one with an end")
 
 
-def _check_numbers(tag: str, key: str, text: str) -> None:
+def _check_numbers(part: ElementTree.Element, key: str, text: str) -> None:
     """Raise a ValueError for numbers of which one is none; MuJoCo would go on with it."""
     try:
         numbers = [float(word) for word in text.split()]
     except ValueError:
         return
     if any(map(math.isnan, numbers)):
-        raise ValueError(f'<{tag}> has {key}="{text}"; expected numbers')
+        what = f"{part.tag} '{part.get('name', '')}'"
+        raise ValueError(f'{what} has {key}="{text}"; expected numbers')
 
 
 def _whole(text: str) -> int:

@@ -87,7 +87,7 @@ def test_bad_map_files(tmp_path):
     with pytest.raises(ValueError, match="unknown kind"):
         load_map(tmp_path / "map.txt")
     (tmp_path / "map.npz").write_text("not a zip")
-    with pytest.raises(ValueError, match="not a readable .npz"):
+    with pytest.raises(ValueError, match="no readable .npz"):
         load_map(tmp_path / "map.npz")
     with pytest.raises(ValueError, match="cells are 0.3 m"):
         coarsened(nrp_jax.Grid(occupied=np.zeros((3, 3)), resolution=0.3))
