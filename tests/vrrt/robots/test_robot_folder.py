@@ -57,7 +57,7 @@ def test_a_folder_is_a_robot_with_a_self_model(folder, tmp_path):
 
 def test_a_record_comes_back(folder):
     record = robot_folder.read_record(folder)
-    again = dataclasses.replace(record, rounds=2, levels=[{"size_px": 32}])
+    again = dataclasses.replace(record, rounds=2, levels=({"size_px": 32},))
     robot_folder.write_record(folder, again)
     assert robot_folder.read_record(folder) == again
     assert robot_folder.model_file(folder) == folder / MODEL
