@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from vrrt_jax.robots.xml_file import xml_root
+from vrrt_jax.robots.xml_file import check_number, xml_root
 
 _PACKAGES = ("package://", "model://", "$(find ")  # before the name of a package
 _FILE = "file://"
@@ -63,7 +63,12 @@ def urdf_spec(root: ElementTree.Element, path: Path, *, visuals: bool) -> mujoco
         limit = joint.find("limit")
         if limit is not None and joint.get("type") in _LIMITED and _NAMES & set(limit.keys()):
             for name in sorted(_NAMES):
-                limit.set(name, limit.get(name, "0"))  # MuJoCo takes one alone for none at all
+                # MuJoCo takes one alone for none at all. NaN is told of later.
+                text = limit.get(name, "0")
+                limit.set(name, "0" if text.strip().lower() == "nan" else text)
+    for part in root.iter():
+        for key, text in part.attrib.items():
+            check_number(part, key, text)
     _narrow_to_soft_limits(root)
     compiler.set("discardvisual", "false" if visuals else "true")
     folder = path.resolve().parent

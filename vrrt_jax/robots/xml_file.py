@@ -58,7 +58,7 @@ def check_mjcf(path: str | Path) -> None:
             if key.startswith("file"):
                 for folder in folders:
                     _check_end(path.parent / folder / text, text)
-            _check_numbers(part, key, text)
+            check_number(part, key, text)
         keys, most = _COUNTS.get(part.tag, ((), 0))
         if keys and (number := math.prod(_whole(part.get(key, "")) for key in keys)) > most:
             raise ValueError(
@@ -95,7 +95,7 @@ def _check_end(place: Path, name: str) -> None:
         raise ValueError(f"it names '{name}', which is no plain file; expected one with an end")
 
 
-def _check_numbers(part: ElementTree.Element, key: str, text: str) -> None:
+def check_number(part: ElementTree.Element, key: str, text: str) -> None:
     """Raise a ValueError for numbers of which one is none; MuJoCo would go on with it."""
     try:
         numbers = [float(word) for word in text.split()]
