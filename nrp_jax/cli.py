@@ -81,7 +81,7 @@ def _plan(arguments: argparse.Namespace) -> int:
     from nrp_jax.planner import plan
     from nrp_jax.planners.by_name import CONNECT, KINDS
     from nrp_jax.planners.nrp_connect import UNCHECKED, default_planner
-    from nrp_jax.samplers import load_sampler
+    from nrp_jax.samplers import load_sampler, weights_of
     from nrp_jax.scene.world import build_world
 
     problem = _problem(arguments)
@@ -97,19 +97,21 @@ def _plan(arguments: argparse.Namespace) -> int:
             )
         settings = UNCHECKED if method in CONNECT else {}
         sampler = load_sampler(robot.name, KINDS[method], arguments.model, **settings)
-    result = plan(
-        robot,
-        grid,
-        problem.q_start,
-        problem.q_goal,
-        key=jax.random.key(arguments.seed),
-        planner=method,
-        sampler=sampler,
-        world=world,
-        max_expansions=arguments.max_expansions,
-        capacity=arguments.capacity,
-        time_limit_s=arguments.time_limit,
-    )
+    own = [] if arguments.model is None else [arguments.model]
+    with weights_of(*own):
+        result = plan(
+            robot,
+            grid,
+            problem.q_start,
+            problem.q_goal,
+            key=jax.random.key(arguments.seed),
+            planner=method,
+            sampler=sampler,
+            world=world,
+            max_expansions=arguments.max_expansions,
+            capacity=arguments.capacity,
+            time_limit_s=arguments.time_limit,
+        )
     print(result)
     out, record = Path(arguments.out), _record(problem, method, arguments.seed, result)
     with command.or_printed(lambda: json.dumps(record)), replacing(out / "path.json", "w") as file:

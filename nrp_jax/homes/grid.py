@@ -257,7 +257,7 @@ def _read_npz(path: Path, crop: tuple[float, float, float, float] | None) -> Gri
             raise ValueError(f"its {name} is of type {array.dtype}; expected numbers")
     origin, resolution = arrays.get("origin_m", np.zeros(3)), arrays.get("resolution_m", RESOLUTION)
     if np.size(resolution) != 1:
-        raise ValueError(f"its resolution_m is {resolution.tolist()}; expected one number")
+        raise ValueError(f"its resolution_m has shape {np.shape(resolution)}; expected one number")
     if np.shape(origin) not in ((2,), (3,)):
         raise ValueError(f"its origin_m has shape {np.shape(origin)}; expected (3,): x, y, z in m")
     grid = Grid(
