@@ -9,6 +9,7 @@ that what kills it is told too.
 
 import argparse
 import contextlib
+import functools
 import json
 import os
 import resource
@@ -76,10 +77,19 @@ class Inputs:
         place, words = self.commands[int(rng.integers(len(self.commands)))]
         near = [file for file in self.files if self._is_read(file, place, words)]
         file = near[int(rng.integers(len(near)))]
-        done = damage(rng, file, self.files)
+        return file, damage(rng, file, self.files), self.written(words)
+
+    def written(self, words: list[str]) -> list[str]:
+        """A command with the empty folder that it writes into."""
         shutil.rmtree(self.out, ignore_errors=True)
         self.out.mkdir()
-        return file, done, [word.replace("OUT", str(self.out)) for word in words]
+        return [word.replace("OUT", str(self.out)) for word in words]
+
+    def reading(self, name: str) -> tuple[Path, list[str]]:
+        """A file by its name, and the first command that reads it."""
+        file = self.folder / name
+        words = next(words for place, words in self.commands if self._is_read(file, place, words))
+        return file, self.written(words)
 
     def _is_read(self, file: Path, place: str, words: list[str]) -> bool:
         named = [word for word in words if word.startswith(str(self.folder))]
@@ -203,33 +213,37 @@ def faults(inputs: Inputs, name: str, file: Path, words: list[str]) -> tuple[lis
     return found, f"{code}: {heard.strip()[:700]}"
 
 
-def run_case(inputs: Inputs, name: str, seed: int, number: int) -> dict:
-    """Damage, ask, judge, mend."""
-    file, done, words = inputs.case(seed, number)
+def judged(inputs: Inputs, name: str, file: Path, done: str, words: list[str]) -> dict:
+    """Ask, judge, and mend the file."""
     try:
         found, told = faults(inputs, name, file, words)
     finally:
         inputs.mend()
     where = str(file.relative_to(inputs.folder))
-    return {
-        **{"number": number, "command": " ".join(words[:2]), "file": where, "done": done},
-        **{"faults": found, "told": told.replace(str(inputs.folder), "IN")},
-    }
+    told = told.replace(str(inputs.folder), "IN")
+    return {"command": words[:2], "file": where, "done": done, "faults": found, "told": told}
 
 
-def work(name: str, seed: int, numbers: range, say=print) -> list[dict]:
-    """Try cases one after the other."""
-    rows, here = [], os.getcwd()
+@contextlib.contextmanager
+def inputs_of(name: str):
+    """The valid inputs of a command in a folder of their own, which is the working directory."""
+    here = os.getcwd()
     with tempfile.TemporaryDirectory() as folder, reading_only(name):
         os.chdir(folder)
         try:
-            inputs = Inputs(name, Path(folder))
-            for number in numbers:
-                say(json.dumps({"begin": number}), flush=True)
-                rows.append(run_case(inputs, name, seed, number))
-                say(json.dumps(rows[-1]), flush=True)
+            yield Inputs(name, Path(folder))
         finally:
             os.chdir(here)
+
+
+def work(name: str, seed: int, numbers: range, say=lambda line: None) -> list[dict]:
+    """Try cases one after the other."""
+    rows = []
+    with inputs_of(name) as inputs:
+        for number in numbers:
+            say(json.dumps({"begin": number}))
+            rows.append({"number": number, **judged(inputs, name, *inputs.case(seed, number))})
+            say(json.dumps(rows[-1]))
     return rows
 
 
@@ -273,7 +287,8 @@ def main() -> int:
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.worker:
-        work(given.command, given.seed, range(given.first, given.count))
+        say = functools.partial(print, flush=True)
+        work(given.command, given.seed, range(given.first, given.count), say)
         return 0
     bad = refused = 0
     for row in watched(given.command, given.seed, given.count, given.first):

@@ -130,7 +130,7 @@ def read_poses(file: Path, robot: MobileRobot, key: str | None = None) -> dict[s
     """
     try:
         named = dict(read_arrays(file) if file.suffix == ".npz" else read_json(file))
-    except (ValueError, TypeError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(
             f"'{file}' holds no poses ({error}); expected a JSON object or an .npz of named "
             "configurations"

@@ -117,7 +117,7 @@ def _origin(value: Any) -> tuple[float, float]:
 def _number(value: Any, name: str) -> float:
     try:
         number = math.nan if isinstance(value, bool) else float(value)  # YAML reads 1e-2 as text
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
         raise ValueError(f"its {name} has {value!r}; expected a finite number")

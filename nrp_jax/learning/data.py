@@ -215,7 +215,7 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
             record_of(Shard, entry, f"the shard '{name}'")
             if Path(name).name != name:
                 raise ValueError(f"the shard '{name}' is not in the folder")
-    except (ValueError, TypeError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(
             f"'{path}' is not readable ({error}); remove the folder and write it again"
         ) from error

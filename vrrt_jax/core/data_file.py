@@ -42,7 +42,7 @@ def read_json(path: str | Path) -> Any:
     """
     text = read_text(path, "JSON")
     try:
-        return json.loads(text, object_pairs_hook=_without_duplicates)
+        return json.loads(text, object_pairs_hook=_without_duplicates, parse_int=_whole)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"'{path}' is not valid JSON: {error}") from None
 
@@ -89,6 +89,22 @@ def _object(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
     return _without_duplicates(pairs)
 
 
+def _whole(text: str) -> int:
+    """A whole number that fits into 64 bits: others overflow wherever they are used."""
+    return _fitting(int(text))
+
+
+def _fitting(number: int) -> int:
+    if abs(number) >= 1 << 63:
+        raise ValueError(f"a number of {len(str(number))} digits is too large; expected 64 bits")
+    return number
+
+
+def _whole_of_yaml(loader: _Loader, node: yaml.ScalarNode) -> int:
+    return _fitting(loader.construct_yaml_int(node))
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _whole_of_yaml)
 _Loader.add_constructor("tag:yaml.org,2002:map", _object)
 _Loader.add_constructor(_OPENCV_MATRIX, _object)
 

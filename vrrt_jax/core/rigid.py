@@ -20,7 +20,7 @@ def rigid(transform: Any, what: str) -> np.ndarray:
     """
     try:
         matrix = np.asarray(transform, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{what} is not made of numbers; expected 4 rows of 4") from None
     if matrix.shape != (4, 4):
         raise ValueError(

@@ -61,7 +61,7 @@ def frozen_positions(
             raise ValueError(f"freeze: joint '{name}' not in robot; have: {', '.join(names)}")
         try:
             frozen[name] = float(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             frozen[name] = np.nan
         if not np.isfinite(frozen[name]):
             raise ValueError(

@@ -234,7 +234,7 @@ def _numbers(values: Any) -> np.ndarray:
     """Numbers as an array; NaN for what is none."""
     try:
         return np.asarray(values, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return np.array(np.nan)
 
 

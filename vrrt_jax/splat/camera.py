@@ -147,7 +147,7 @@ def _vector(values: Any, length: int, what: str) -> np.ndarray:
     """Finite numbers (length,) in float64, or a ValueError."""
     try:
         vector = np.asarray(values, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         vector = np.array(np.nan)
     if vector.shape != (length,) or not np.all(np.abs(vector) < _LARGEST):
         raise ValueError(f"{what} is {values!r}; expected {length} finite numbers")
