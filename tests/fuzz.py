@@ -184,10 +184,10 @@ def faults(inputs: Inputs, name: str, file: Path, words: list[str]) -> tuple[lis
     """What is not as it should be about the answer, and the answer."""
     from vrrt_jax.core.command import KNOWN_ERRORS
 
-    before, started = inputs.snapshot(), time.monotonic()
+    before, started = inputs.snapshot(), time.process_time()
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     code, heard, errors, warned = answer(name, words)
-    took = time.monotonic() - started
+    took = time.process_time() - started
     grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - most)
     lines = [line for line in heard.splitlines() if "\r" not in line]
     found = []

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import zipfile
+from pathlib import Path
 
 import fuzz
 import numpy as np
@@ -119,6 +120,7 @@ def test_a_process_answers_too():
         file, words = inputs.reading("problem/self_model.npz")
         file.write_text("a text")
         command = [sys.executable, "-m", "vrrt_jax.cli", *words]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+        root = Path(__file__).parents[1]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=root)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
     assert "self_model.npz' is no readable .npz" in done.stderr

@@ -13,7 +13,7 @@ import numpy as np
 
 from nrp_jax.learning.models import CVAE, NEXT, Discriminator, ModelConfig, check_choices
 from nrp_jax.learning.next_network import PlanningNetwork
-from vrrt_jax.core.arrays_file import read_arrays
+from vrrt_jax.core.arrays_file import MOST_WEIGHTS, read_arrays
 from vrrt_jax.core.fields import record_of
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.precision import single_precision
@@ -74,7 +74,7 @@ def load_model(path: str | Path) -> Model:
     if not path.is_file():
         raise ValueError(f"no model at '{path}'; train one with: nrp train")
     try:
-        arrays = read_arrays(path, "description")
+        arrays = read_arrays(path, "description", most=MOST_WEIGHTS)
         description = json.loads(str(arrays.pop("description")))
         if description["version"] != VERSION:
             raise ValueError(f"it is of version {description['version']!r}, not {VERSION}")

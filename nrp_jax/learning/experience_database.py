@@ -11,7 +11,7 @@ import numpy as np
 
 from nrp_jax.learning.checkpoint import variables_of
 from nrp_jax.learning.models import FIRE
-from vrrt_jax.core.arrays_file import read_arrays
+from vrrt_jax.core.arrays_file import MOST_WEIGHTS, read_arrays
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.precision import single_precision
 
@@ -62,7 +62,7 @@ def load_database(path: str | Path, task: str) -> Database:
     if not path.is_file():
         raise ValueError(f"no database at '{path}'; make one with: nrp train --model {FIRE}")
     try:
-        arrays = read_arrays(path, "description", "latents", "samples")
+        arrays = read_arrays(path, "description", "latents", "samples", most=MOST_WEIGHTS)
         description = json.loads(str(arrays.pop("description")))
         if (description["kind"], description["version"]) != (FIRE, VERSION):
             raise ValueError("it is of another kind or version")

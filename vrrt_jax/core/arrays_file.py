@@ -15,11 +15,12 @@ _HEADERS = {
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 _SMALL = 1 << 26  # bytes that there always are
+MOST_WEIGHTS = 1 << 27  # bytes of what networks and splats have learned
 # What NumPy and zipfile raise for what is damaged; RuntimeError is of archives with a password.
 _DAMAGE = (OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
 
-def read_arrays(path: str | Path, *needed: str) -> dict[str, np.ndarray]:
+def read_arrays(path: str | Path, *needed: str, most: int | None = None) -> dict[str, np.ndarray]:
     """All arrays of an ``.npz``, by name.
 
     Nothing is unpickled. What the file says of sizes is compared with what it holds and with the
@@ -28,6 +29,7 @@ def read_arrays(path: str | Path, *needed: str) -> dict[str, np.ndarray]:
     Args:
         path: of the file.
         needed: names of arrays that must be there.
+        most: bytes of all arrays together; what the memory has room for if None.
 
     Raises:
         FileNotFoundError: no such file.
@@ -38,6 +40,8 @@ def read_arrays(path: str | Path, *needed: str) -> dict[str, np.ndarray]:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
             size = sum(member.file_size for member in members)
+            if most is not None and size > most:
+                raise ValueError(f"what is in it has {size} bytes; expected at most {most}")
             if size > _SMALL:
                 check_memory(size, "what is in it", "give a smaller file")
             for member in members:

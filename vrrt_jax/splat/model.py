@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.arrays_file import read_arrays
+from vrrt_jax.core.arrays_file import MOST_WEIGHTS, read_arrays
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.splat.types import SplatModel
@@ -100,7 +100,7 @@ def load_self_model(path: str | Path) -> SelfModel:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no self-model at '{path}'; train one with: vrrt fit")
-    arrays = read_arrays(path, "header")
+    arrays = read_arrays(path, "header", most=MOST_WEIGHTS)
     try:
         header = json.loads(str(arrays["header"]))
         if header["format"] != FORMAT:

@@ -79,6 +79,8 @@ def test_headers_that_lie_are_refused(tmp_path, content, words):
 def test_what_does_not_fit_into_the_memory_is_not_read(tmp_path, monkeypatch):
     member(tmp_path / "a.npz", "a.npy", header((1 << 23,), "|u1") + bytes(1 << 23))
     assert (tmp_path / "a.npz").stat().st_size < 1 << 20
+    with pytest.raises(ValueError, match="expected at most 1000"):
+        read_arrays(tmp_path / "a.npz", most=1000)
     monkeypatch.setattr(memory, "free_memory", lambda: 1 << 20)
     monkeypatch.setattr(arrays_file, "_SMALL", 0)
     monkeypatch.setattr(arrays_file, "_read_array", None)  # nothing is read
