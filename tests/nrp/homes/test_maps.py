@@ -1,5 +1,7 @@
 """Maps and their files: cells, ROS's map_server, MJCF scenes, and what is refused."""
 
+import warnings
+
 import mujoco
 import numpy as np
 import pytest
@@ -378,3 +380,11 @@ def test_malformed_npz_maps(tmp_path, arrays, message):
     np.savez(tmp_path / "map.npz", **{"occupied": np.zeros((4, 4), bool), **arrays})
     with pytest.raises(ValueError, match=message):
         load_map(tmp_path / "map.npz")
+
+
+def test_a_crop_beyond_the_map_is_told(tmp_path):
+    nrp_jax.Grid(occupied=np.eye(30, dtype=bool)).save(tmp_path / "map.npz")
+    with pytest.warns(UserWarning, match=r"reaches beyond the map; .* spans .* to \[3.0, 2.0\] m"):
+        assert load_map(tmp_path / "map.npz", crop=(1, 1, 5, 2)).occupied.shape == (20, 10, 1)
+    with warnings.catch_warnings(action="error"):
+        load_map(tmp_path / "map.npz", crop=(0, 0, 3, 3))

@@ -104,3 +104,14 @@ def test_soft_limits_of_a_urdf_hold(tmp_path):
             load_robot(file)
     file.write_text(urdf.replace("SOFT", '<safety_controller k_velocity="1"/>'))
     assert load_robot(file).upper[0] == 2.0
+
+
+def test_a_home_outside_of_the_limits_is_told(tmp_path):
+    file = tmp_path / "robot.xml"
+    file.write_text(
+        f"<mujoco><worldbody>{BODY.replace('-1 1', '-50 50')}</worldbody>"
+        '<keyframe><key name="home" qpos="2"/></keyframe></mujoco>'
+    )
+    with pytest.warns(UserWarning, match="home is outside of the limits: turn is at 2, .* 0.87"):
+        robot = load_robot(file)
+    assert robot.home[0] == pytest.approx(robot.upper[0])
