@@ -82,6 +82,8 @@ ONCE = [
     ("vrrt", "problem/self_model.npz", lambda file: file.write_text("a text")),
     ("vrrt", "problem/self_model.npz", terabyte("2/tau")),
     ("vrrt", "problem/self_model.npz", array("2/rgb", lambda a: a[:0])),
+    ("vrrt", "problem/self_model.npz", array("1/radius", lambda a: a.astype(complex))),
+    ("vrrt", "problem/self_model.npz", array("2/shade", lambda a: a.astype(float) + 1e308)),
     ("vrrt", "problem/problem.json", fields(start=[[0.0]])),
     ("vrrt", "plan/path.npz", array("path", lambda a: a[:, :3])),
     ("vrrt", "plan/tree.npz", array("parent", lambda a: a + 9)),

@@ -13,7 +13,7 @@ import numpy as np
 
 from nrp_jax.learning.models import CVAE, NEXT, Discriminator, ModelConfig, check_choices
 from nrp_jax.learning.next_network import PlanningNetwork
-from vrrt_jax.core.arrays_file import MOST_WEIGHTS, read_arrays
+from vrrt_jax.core.arrays_file import MOST_WEIGHTS, float32_of, read_arrays
 from vrrt_jax.core.fields import record_of
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.precision import single_precision
@@ -98,9 +98,7 @@ def variables_of(arrays: Mapping[str, np.ndarray]) -> Any:
     """
     flat = {}
     for name, array in arrays.items():
-        if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
-            raise ValueError(f"its {name} of type {array.dtype} has no finite numbers")
-        flat[name.removeprefix("variables/")] = jnp.asarray(array, jnp.float32)
+        flat[name.removeprefix("variables/")] = jnp.asarray(float32_of(array, name))
     return flax.traverse_util.unflatten_dict(flat, sep="/")
 
 

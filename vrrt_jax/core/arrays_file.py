@@ -62,6 +62,17 @@ def read_arrays(path: str | Path, *needed: str, most: int | None = None) -> dict
     return arrays
 
 
+def float32_of(array: np.ndarray, name: str) -> np.ndarray:
+    """Numbers of an archive in float32.
+
+    Raises:
+        ValueError: they are no numbers, not finite, or too large for float32.
+    """
+    if array.dtype.kind not in "fiu" or not np.all(np.abs(array) < np.finfo(np.float32).max):
+        raise ValueError(f"its {name} of type {array.dtype} has values that are no finite numbers")
+    return array.astype(np.float32)
+
+
 def _read_array(file: zipfile.ZipExtFile, size: int, name: str) -> np.ndarray:
     """An array of an archive's member of so many bytes.
 

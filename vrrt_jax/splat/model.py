@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from vrrt_jax.core.arrays_file import MOST_WEIGHTS, read_arrays
+from vrrt_jax.core.arrays_file import MOST_WEIGHTS, float32_of, read_arrays
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.splat.types import SplatModel
@@ -139,14 +139,12 @@ def _level(
     """
     found = {}
     for field, array in ARRAYS.items():
-        value = arrays[f"{name}/{array}"]
-        found[field] = value = value.astype(np.int32 if array == "link" else np.float32)
+        value = float32_of(arrays[f"{name}/{array}"], f"{name}/{array}")
+        found[field] = value = value.astype(np.int32) if array == "link" else value
         if value.shape != (found["mean"].shape[:1], ())[array == "tau"] + (3,) * (
             array in ("mean", "rgb", "shade")
         ):
             raise ValueError(f"its {name}/{array} has shape {value.shape}")
-        if not np.isfinite(value).all():
-            raise ValueError(f"its {name}/{array} has values that are no finite numbers")
     link, starts = found["link"], tuple(numbers["starts"])
     if not len(link) or link.min() < 0 or link.max() >= num_links or np.any(np.diff(link) < 0):
         raise ValueError(f"its {name}/link is not of a robot with {num_links} links")
