@@ -4,6 +4,7 @@ import math
 import zipfile
 import zlib
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -73,7 +74,7 @@ def float32_of(array: np.ndarray, name: str) -> np.ndarray:
     return array.astype(np.float32)
 
 
-def _read_array(file: zipfile.ZipExtFile, size: int, name: str) -> np.ndarray:
+def _read_array(file: IO[bytes], size: int, name: str) -> np.ndarray:
     """An array of an archive's member of so many bytes.
 
     Raises:
@@ -88,8 +89,8 @@ def _read_array(file: zipfile.ZipExtFile, size: int, name: str) -> np.ndarray:
     told, there = math.prod(shape) * dtype.itemsize, size - file.tell()
     if told != there or min(shape, default=0) < 0:
         raise ValueError(f"the array '{name}' of {there} bytes says that it has shape {shape}")
-    content = bytearray(there)
-    if file.readinto(content) != there:
+    content = bytearray(file.read(there))
+    if len(content) != there:
         raise EOFError(f"the array '{name}' is cut off")
     flat = np.frombuffer(content, dtype, count=math.prod(shape))
     return flat.reshape(shape, order="F" if is_fortran else "C")
