@@ -13,7 +13,7 @@ from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
 OUTSIDE = (
-    *("CONTRIBUTING.md", "notebooks/*.ipynb", "notebooks/*.py", "scenes/*.png"),
+    *("CONTRIBUTING.md", "SECURITY.md", "notebooks/*.ipynb", "notebooks/*.py", "scenes/*.png"),
     *("notebooks/results/*.md", "notebooks/results/*.png"),
 )
 LINK = re.compile(r"\[([^\]]*)\]\((?!https?:|#)([^)#\s]+)([^)]*)\)")

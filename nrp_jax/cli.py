@@ -82,7 +82,7 @@ def _plan(arguments: argparse.Namespace) -> int:
     from nrp_jax.planner import plan
     from nrp_jax.planners.by_name import CONNECT, KINDS
     from nrp_jax.planners.nrp_connect import UNCHECKED, default_planner
-    from nrp_jax.samplers import load_sampler
+    from nrp_jax.samplers import load_sampler, weights_of
     from nrp_jax.scene.world import build_world
 
     problem = _problem(arguments)
@@ -98,7 +98,8 @@ def _plan(arguments: argparse.Namespace) -> int:
             )
         settings = UNCHECKED if method in CONNECT else {}
         sampler = load_sampler(robot.name, KINDS[method], arguments.model, **settings)
-    with interruptible() as interrupted:
+    own = [] if arguments.model is None else [arguments.model]
+    with interruptible() as interrupted, weights_of(*own):
         result = plan(
             robot,
             grid,

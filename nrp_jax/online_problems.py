@@ -22,6 +22,7 @@ from nrp_jax.planners.by_name import policy_of
 from nrp_jax.samplers import make_sampler
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import build_world
+from vrrt_jax.core.arrays_file import read_arrays
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.interrupt import uninterrupted
@@ -56,9 +57,8 @@ class Problems:
         settings = self.settings
         num_states = self.dataset.settings.waypoints + 2
         if file.exists():
-            with np.load(file) as saved:
-                arrays = {name: saved[name] for name in ("home", "q", "length")}
-                return FoundPaths(**arrays, tried=int(saved["tried"]))
+            arrays: dict[str, Any] = read_arrays(file, "home", "q", "length", "tried")
+            return FoundPaths(**arrays | {"tried": int(arrays["tried"])})
         homes, paths, lengths, problem = [], [], [], first
         while problem < settings.problems and len(paths) * (num_states - 1) < settings.states:
             home, world, path = self._solved(problem, model)

@@ -1,7 +1,6 @@
 """Problems in homes as folders: ``problem.json`` and the map beside it."""
 
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ import numpy as np
 from nrp_jax.homes.grid import Grid, load_map
 from nrp_jax.scene.configurations import check_shape
 from nrp_jax.scene.robots import MobileRobot, load_robot
+from vrrt_jax.core.data_file import of_file, read_json
 from vrrt_jax.core.fields import check_fields
 
 FIELDS = ("robot", "map", "start", "goal")  # of problem.json
@@ -53,24 +53,24 @@ def load_problem(name_or_path: str | Path) -> Problem:
             f"no problem at '{name_or_path}'; packaged ones: {', '.join(problem_names())}, or give "
             "a folder with a problem.json"
         )
-    try:
-        fields = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"'{file}' is not valid JSON: {error}") from None
+    fields = read_json(file)
     check_fields(fields, FIELDS, f"'{file}'")
     if missing := [name for name in FIELDS if name not in fields]:
         raise ValueError(
             f"'{file}' lacks the field '{missing[0]}'; expected {', '.join(FIELDS)}: see the "
             "packaged problems"
         )
-    robot = load_robot(fields["robot"])
-    for name in ("start", "goal"):
-        check_shape(robot, fields[name], name)
+    with of_file(file):
+        for name in ("robot", "map"):
+            if not isinstance(fields[name], str):
+                raise ValueError(f"its {name} is {fields[name]!r}; expected a text")
+        robot = load_robot(fields["robot"])
+        q_start, q_goal = (check_shape(robot, fields[name], name) for name in ("start", "goal"))
     return Problem(
         name=folder.resolve().name,
         robot=robot,
         grid=load_map(folder / fields["map"]),
         map_file=folder / fields["map"],
-        q_start=np.array(fields["start"], np.float32),
-        q_goal=np.array(fields["goal"], np.float32),
+        q_start=q_start,
+        q_goal=q_goal,
     )

@@ -6,12 +6,15 @@ pytrees, so that other weights never re-compile a planner. Letters: ``B`` lanes,
 ``D`` joints, ``F`` link frames, ``K`` waypoints of a lane.
 """
 
+import contextlib
 import functools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+from flax.errors import FlaxError
 
 from nrp_jax.generators import CVAESampler, Generator, GlobalCVAESampler
 from nrp_jax.guides import NEXTGuide
@@ -225,11 +228,34 @@ def load_sampler(task: str, kind: str, path: str | Path | None = None, **setting
     """
     path = packaged_file(task, kind) if path is None else Path(path)
     if kind == FIRE:
-        return ExperienceSampler(load_robot(task), load_database(path, task), **settings)
-    check_choices(task, kind)
-    model = load_model(path)
-    check_model(model, path, task=task, kind=kind)
-    return make_sampler(model, **settings)
+        sampler = ExperienceSampler(load_robot(task), load_database(path, task), **settings)
+    else:
+        check_choices(task, kind)
+        model = load_model(path)
+        check_model(model, path, task=task, kind=kind)
+        if type(model.info.get("num_outputs")) is not int:
+            raise ValueError(f"'{path}' does not say how many outputs its network has")
+        sampler = make_sampler(model, **settings)
+    return sampler
+
+
+@contextlib.contextmanager
+def weights_of(*paths: str | Path) -> Iterator[None]:
+    """What networks raise inside for weights that are not theirs names the files, if there are any.
+
+    Weights and the description beside them are first put together where a network is asked.
+    """
+    try:
+        yield
+    except (FlaxError, TypeError, ArithmeticError, LookupError) as error:
+        if not paths:
+            raise
+        text = " ".join(str(error).split()) or type(error).__name__
+        named = ", ".join(f"'{path}'" for path in paths)
+        raise ValueError(
+            f"the weights in {named} are not those of the network that "
+            f"is described there ({text[:200]}); train it again with: nrp train"
+        ) from None
 
 
 @single_precision

@@ -1,6 +1,5 @@
 """A plan in a home in the browser: the map, the tree, and the robot along its path."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,8 @@ from nrp_jax.scene.exact import merge_cells
 from nrp_jax.scene.robots import MobileRobot, load_robot
 from nrp_jax.scene.world import GridWorld, build_world
 from nrp_jax.viz import base_lines
+from vrrt_jax.core.command import LARGEST
+from vrrt_jax.core.data_file import read_json
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.tree_file import Nodes, load_nodes, nodes_of
 from vrrt_jax.scene.page import Page, colors_of
@@ -77,12 +78,19 @@ def view_folder(folder: Path, *, port: int | None = None) -> Page:
             f"no plan at '{folder}': it has no path.json; write one with: nrp plan --out FOLDER"
         )
     try:
-        record = json.loads(file.read_text(encoding="utf-8"))
-        robot, trajectory = load_robot(record.pop("robot")), np.array(record.pop("trajectory"))
+        record = dict(read_json(file))
+        robot = load_robot(record.pop("robot"))
+        trajectory = np.array(record.pop("trajectory"), float)
         del record["path"]
-    except (ValueError, KeyError) as error:
+        record["status"]  # noqa: B018 - it raises where there is none
+        if trajectory.ndim != 2 or trajectory.shape[1] != robot.num_joints:
+            raise ValueError(f"its trajectory has shape {trajectory.shape}")
+        if not (len(trajectory) and np.abs(trajectory).max() < LARGEST):
+            raise ValueError("its trajectory is empty, or has numbers that are none or too large")
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"'{file}' is no readable plan ({error}); plan again") from None
-    grid, nodes = load_map(folder / "map.npz"), load_nodes(folder / "tree.npz")
+    grid = load_map(folder / "map.npz")
+    nodes = load_nodes(folder / "tree.npz", robot.num_joints)
     return _page(robot, grid, build_world(robot, grid), trajectory, nodes, record, port)
 
 

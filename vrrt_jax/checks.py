@@ -59,7 +59,7 @@ def _array(q: Any, what: str) -> np.ndarray:
     try:
         with np.errstate(over="ignore"):  # what is too large becomes infinite
             return np.asarray(q, np.float32)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"the {what} is {q!r}; expected numbers, one for each joint") from None
 
 

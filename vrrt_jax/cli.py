@@ -204,7 +204,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
 def _motion_limits(arguments: argparse.Namespace, robot):
     """Limits for ``--trajectory``, asked for before the plan; None without it."""
     import vrrt_jax
-    from vrrt_jax import problems
+    from vrrt_jax.core.data_file import of_file, read_json
     from vrrt_jax.motion.export import checked_suffix
 
     if arguments.trajectory is None:
@@ -212,8 +212,11 @@ def _motion_limits(arguments: argparse.Namespace, robot):
             raise ValueError("--limits is for --trajectory, which is not given; give both")
         return None
     checked_suffix(arguments.trajectory)
-    given = {} if arguments.limits is None else problems.read_json(arguments.limits)
-    return vrrt_jax.motion_limits(robot, vrrt_jax.MotionLimits.from_dict(given))
+    if arguments.limits is None:
+        return vrrt_jax.motion_limits(robot)
+    with of_file(arguments.limits):
+        given = vrrt_jax.MotionLimits.from_dict(read_json(arguments.limits))
+        return vrrt_jax.motion_limits(robot, given)
 
 
 def _pictures(problem, result, out: Path) -> None:
@@ -309,7 +312,7 @@ def _render(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from vrrt_jax import checks
-    from vrrt_jax.core.data_file import read_fields
+    from vrrt_jax.core.data_file import of_file, read_fields
     from vrrt_jax.robots import load_robot
     from vrrt_jax.robots.mesh_sources import needed_mesh_spec
     from vrrt_jax.splat.camera_fields import camera_from_dict
@@ -318,7 +321,8 @@ def _render(arguments: argparse.Namespace) -> int:
 
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
     width, height = arguments.size
-    camera = camera_from_dict(read_fields(arguments.camera), (height, width))
+    with of_file(arguments.camera):
+        camera = camera_from_dict(read_fields(arguments.camera), (height, width))
     q = checks.check_limits(robot, np.array(arguments.q), "configuration")
     picture = MeshRenderer(needed_mesh_spec(robot)).picture(q, camera)
     if not picture.alpha.any():

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from vrrt_jax.checks import check_limits
-from vrrt_jax.core.data_file import read_json
+from vrrt_jax.core.data_file import of_file, read_json
 from vrrt_jax.core.fields import check_fields
 from vrrt_jax.core.files import replacing, write_text
 from vrrt_jax.core.precision import single_precision
@@ -78,7 +78,9 @@ def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
         )
     fields = read_json(file)
     check_fields(fields, FIELDS, f"'{file}'")
-    try:
+    if missing := [name for name in ("robot", "world", "start", "views") if name not in fields]:
+        raise ValueError(f"'{file}' lacks the field {missing[0]}; see the packaged problems")
+    with of_file(file):
         robot = load_robot(_beside(folder, fields["robot"], "robot"))
         self_model = fields.get("self_model")
         self_model = None if self_model is None else _beside(folder, self_model, "self_model")
@@ -91,11 +93,9 @@ def load_problem(name_or_path: str | Path, *, engine: str = "mjx") -> Problem:
             world=load_world(_beside(folder, fields["world"], "world"), robot, engine=engine),
             self_model=load_self_model(self_model_path(robot, self_model)),
             **views_of(photos),
-            q_start=_vector(fields["start"], "start"),
+            q_start=check_limits(robot, fields["start"], "start"),
             true_goal=None if true_goal is None else check_limits(robot, true_goal, "true_goal"),
         )
-    except KeyError as error:
-        raise ValueError(f"'{file}' lacks the field {error}; see the packaged problems") from None
 
 
 def save_problem(problem: Problem, folder: Path) -> None:
@@ -215,6 +215,8 @@ def _checked_views(views: Any, file: Path) -> list[dict[str, Any]]:
         raise ValueError(f"views of '{file}' is {views!r}; expected a list of images and cameras")
     for index, view in enumerate(views):
         check_fields(view, VIEW_FIELDS, f"view {index} of '{file}'")
+        if missing := [name for name in VIEW_FIELDS[:2] if name not in view]:
+            raise ValueError(f"view {index} of '{file}' lacks the field {missing[0]}")
     return views
 
 
@@ -227,10 +229,3 @@ def _beside(folder: Path, name: Any, what: str) -> str:
     if not isinstance(name, str) or not name:
         raise ValueError(f"{what} is {name!r}; expected a name or a path")
     return str(folder / name) if (folder / name).exists() else name
-
-
-def _vector(values: Sequence[float], what: str) -> np.ndarray:
-    try:
-        return np.array(values, np.float32).reshape(-1)
-    except (TypeError, ValueError):
-        raise ValueError(f"{what} is {values!r}; expected a list of numbers") from None

@@ -100,13 +100,18 @@ def _fit(arguments: argparse.Namespace) -> int:
 
 
 def _spheres(arguments: argparse.Namespace) -> int:
+    from vrrt_jax.core.data_file import of_file, read_text
     from vrrt_jax.robots import load_robot
-    from vrrt_jax.robots.mjcf_writer import replace_spheres
+    from vrrt_jax.robots.mjcf_writer import check_written, replace_spheres
     from vrrt_jax.robots.robot_fit import fit_spheres
     from vrrt_jax.scene.obstacles import load_obstacles
     from vrrt_jax.scene.sphere_errors import measure_spheres
 
     robot = load_robot(arguments.robot, freeze=arguments.freeze)
+    if arguments.into is not None:
+        with of_file(arguments.into):
+            check_written(arguments.into)
+    scenes = [load_obstacles(path) for path in arguments.worlds or ()]
     if arguments.out is not None:
         text = fit_spheres(
             robot,
@@ -116,11 +121,10 @@ def _spheres(arguments: argparse.Namespace) -> int:
             progress=print,
         )
         if arguments.into is not None:
-            text = replace_spheres(Path(arguments.into).read_text(), text)
+            text = replace_spheres(read_text(arguments.into, "XML"), text)
         write_text(Path(arguments.out), text)
         print(f"wrote {arguments.out}")
         robot = load_robot(arguments.out)
-    scenes = [load_obstacles(path) for path in arguments.worlds or ()]
     measured = measure_spheres(robot, arguments.num, arguments.seed, scenes)
     covering, thin = robot.collision_spheres.radius, robot.self_collision_spheres.radius
     print(f"{len(covering)} covering and {len(thin)} thin spheres")

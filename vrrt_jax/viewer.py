@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 
 from vrrt_jax import planner
 from vrrt_jax.config import PlannerConfig
+from vrrt_jax.core.arrays_file import read_arrays
 from vrrt_jax.core.edges import difference
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import PlanResult
@@ -101,19 +101,34 @@ def view_folder(folder: Path, *, port: int | None = None) -> Page:
         )
     # The engine that loads fastest, and plans fastest if the page asks for that.
     problem = load_problem(folder / "problem", engine="closed_form")
-    try:
-        with np.load(folder / "path.npz") as file:
-            path, raw_path = file["path"], file["raw_path"]
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"'{folder / 'path.npz'}' is no path ({error}); plan again") from None
     plan = _Plan(
-        path=path,
-        raw_path=raw_path,
-        nodes=load_nodes(folder / "tree.npz"),
+        **_paths(folder / "path.npz", problem.robot.num_joints),
+        nodes=load_nodes(folder / "tree.npz", problem.robot.num_joints),
         numbers=read_json(folder / "result.json"),
     )
+    if not isinstance(plan.numbers, dict) or "status" not in plan.numbers:
+        raise ValueError(f"'{folder / 'result.json'}' has no status; plan again")
     page = Page(f"{problem.robot.name}: {plan.numbers['status']}", port)
     return _filled(page, plan, problem.world, problem.goal, None)
+
+
+def _paths(file: Path, num_joints: int) -> dict[str, np.ndarray]:
+    """The paths (P, D) of a file, by name.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is damaged, or of another robot.
+    """
+    arrays = read_arrays(file, "path", "raw_path")
+    paths = {name: arrays[name] for name in ("path", "raw_path")}
+    for name, path in paths.items():
+        is_path = path.dtype.kind == "f" and path.ndim == 2 and path.shape[1] == num_joints
+        if not (is_path and len(path) and np.isfinite(path).all()):
+            raise ValueError(
+                f"'{file}': {name} of shape {path.shape} is no path of the problem's robot; "
+                f"expected finite numbers (P, {num_joints}): plan again"
+            )
+    return paths
 
 
 def _plan_of(world: World, result: PlanResult) -> _Plan:

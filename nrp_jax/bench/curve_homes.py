@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import itertools
-import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,6 +20,8 @@ from nrp_jax.scene.configurations import check_configuration, check_shape
 from nrp_jax.scene.nearest import nearest_free
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld, build_world
+from vrrt_jax.core.arrays_file import read_arrays
+from vrrt_jax.core.data_file import read_json
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,6 +105,8 @@ def from_maps(
                 else _with_poses(robot, name, grid, poses, queries, legs)
             )
         except ValueError as error:
+            if len(grids) == 1:
+                raise ValueError(f"map '{name}' of '{folder}': {error}") from None
             print(f"map '{name}' is left out: {error}", file=sys.stderr)
         if len(found) == num:
             break
@@ -126,12 +129,8 @@ def read_poses(file: Path, robot: MobileRobot, key: str | None = None) -> dict[s
         OSError: it cannot be read.
     """
     try:
-        if file.suffix == ".npz":
-            with np.load(file, allow_pickle=False) as saved:
-                named = dict(saved)
-        else:
-            named = dict(json.loads(file.read_text()))
-    except (ValueError, TypeError, EOFError) as error:
+        named = dict(read_arrays(file) if file.suffix == ".npz" else read_json(file))
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(
             f"'{file}' holds no poses ({error}); expected a JSON object or an .npz of named "
             "configurations"

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from nrp_jax.homes.grid import Grid, load_map
+from vrrt_jax.core.data_file import of_file
 
 KINDS = (".npz", ".yaml", ".yml", ".xml")
 
@@ -18,19 +19,21 @@ def load_maps(folder: Path, robot: str, fit: Callable[[Grid], Grid]) -> dict[str
         fit: makes of a map what is wanted of it, or raises ValueError.
 
     Raises:
-        ValueError: no map fits.
+        ValueError: no map fits; of one file, why it does not.
     """
-    files = [folder] if folder.is_file() else sorted(folder.rglob("*"))
+    if folder.is_file() and folder.suffix in KINDS:
+        with of_file(folder):
+            return {folder.name: fit(load_map(folder))}
     grids = {}
-    for file in files:
+    for file in sorted(folder.rglob("*")):
         if file.suffix not in KINDS:
             continue
         try:
             grid = fit(load_map(file))
-        except ValueError as error:
+        except (ValueError, FileNotFoundError) as error:
             print(f"map '{file}' is left out: {error}", file=sys.stderr)
             continue
-        grids[file.name if file == folder else file.relative_to(folder).as_posix()] = grid
+        grids[file.relative_to(folder).as_posix()] = grid
     if not grids:
         raise ValueError(f"no maps for {robot} in '{folder}'; expected {', '.join(KINDS)}")
     return grids

@@ -1,7 +1,6 @@
 """The ``nrp report`` command: curves as figures and tables, beside the authors' numbers."""
 
 import argparse
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 from nrp_jax.bench import paper
 from nrp_jax.bench.curve_table import to_text
 from vrrt_jax.core import command
+from vrrt_jax.core.data_file import of_results, read_json
 from vrrt_jax.core.files import write_text
 from vrrt_jax.core.markdown import table
 
@@ -24,50 +24,59 @@ def write_page(files: Sequence[Path], folder: Path) -> Path:
     """Write ``README.md`` with a table and a figure for each file of ``nrp bench curves``.
 
     Raises:
+        FileNotFoundError: a file is missing.
         ValueError: a file is no results file.
         ModuleNotFoundError: matplotlib is missing.
     """
     found = {file: _read(file) for file in files}
     parts = ["# Success and path optimality in homes", ""]
     for number, (file, results) in enumerate(found.items()):
-        task, here = results["task"], results["machine"]
-        name = f"curves_{number}_{file.stem}.png"
-        _figure(results, folder / name)
-        parts += [
-            f"## {task}: {file.name}",
-            "",
-            f"`{results['command']}`, cores a plan: {here['cores']} of {here['processor']}, "
-            f"homes: {len(results['homes'])}, runs: {results['runs']}",
-            "",
-            to_text(results),
-            "",
-            f"Reference of path optimality: {results['reference']['what']}.",
-            "",
-            *(f"* {note}" for note in results["notes"]),
-            "",
-            f"![success over time and expansions, path optimality over time]({name})",
-            "",
-            f"### {paper.SOURCES[task]}",
-            "",
-            _papers_table(task),
-            "",
-            paper.OPTIMALITY[task],
-            "",
-        ]
+        with of_results(f"'{file}' is no results file of nrp bench curves"):
+            parts += _part(file, results, f"curves_{number}_{file.stem}.png", folder)
     page = folder / "README.md"
     write_text(page, "\n".join(parts))
     return page
 
 
+def _part(file: Path, results: Mapping[str, Any], name: str, folder: Path) -> list[str]:
+    """The lines of one file, whose figure gets a name."""
+    task, here = results["task"], results["machine"]
+    _figure(results, folder / name)
+    return [
+        f"## {task}: {file.name}",
+        "",
+        f"`{results['command']}`, cores a plan: {here['cores']} of {here['processor']}, "
+        f"homes: {len(results['homes'])}, runs: {results['runs']}",
+        "",
+        to_text(results),
+        "",
+        f"Reference of path optimality: {results['reference']['what']}.",
+        "",
+        *(f"* {note}" for note in results["notes"]),
+        "",
+        f"![success over time and expansions, path optimality over time]({name})",
+        "",
+        f"### {paper.SOURCES[task]}",
+        "",
+        _papers_table(task),
+        "",
+        paper.OPTIMALITY[task],
+        "",
+    ]
+
+
 def _read(file: Path) -> dict[str, Any]:
-    try:
-        results = json.loads(file.read_text())
-        to_text(results)
+    """The results of a file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is of another kind.
+    """
+    results = read_json(file)
+    with of_results(f"'{file}' is no results file of nrp bench curves"):
         if results["what"] != "curves":
             raise ValueError(f"it is of '{results['what']}'")
-        return results
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as error:
-        raise ValueError(f"'{file}' is no results file of nrp bench curves: {error!r}") from None
+    return results
 
 
 def _papers_table(task: str) -> str:

@@ -187,11 +187,13 @@ def _run_command(arguments: argparse.Namespace) -> int:
         "checked": not arguments.unchecked,
         "nodes": arguments.nodes,
         "machine": machine(),
-        "unseen_homes": score_homes(robot, dataset.grids, tested, seeds=seeds, **settings),
     }
-    if maps:
-        found = score_homes(robot, [*maps.values()], tested, seeds=range(len(maps)), **settings)
-        figures["maps"] = {**found, "names": [*maps]}
+    own = [path for kind in WAYPOINT_KINDS if (path := getattr(arguments, kind))]
+    with samplers.weights_of(*own):
+        figures["unseen_homes"] = score_homes(robot, dataset.grids, tested, seeds=seeds, **settings)
+        if maps:
+            found = score_homes(robot, [*maps.values()], tested, seeds=range(len(maps)), **settings)
+            figures["maps"] = {**found, "names": [*maps]}
     text = json.dumps(figures, indent=2)
     print(text)
     if arguments.json:

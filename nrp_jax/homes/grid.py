@@ -6,6 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from vrrt_jax.core.arrays_file import read_arrays
+from vrrt_jax.core.data_file import of_file
+
 RESOLUTION = 0.1  # side of the cells that planners and networks expect [m]
 HEIGHT = 2.0  # of the maps [m]; homes end there
 
@@ -139,13 +142,14 @@ def load_map(path: str | Path, *, crop: tuple[float, float, float, float] | None
         raise ValueError(f"map '{path}': unknown kind; expected one of {', '.join(readers)}")
     if crop is not None and (len(crop) != 4 or not np.isfinite(crop).all()):
         raise ValueError(f"crop is {crop}; expected four numbers x0, y0, x1, y1 [m]")
-    try:
-        grid = readers[path.suffix](path, crop)
-        grid = grid if crop is None else grid.crop(crop[:2], crop[2:])
-    except ValueError as error:
-        raise ValueError(f"map '{path}': {error}") from error
-    except MemoryError as error:
-        raise ValueError(f"map '{path}': too little memory; read a part of it, see crop") from error
+    with of_file(path):
+        try:
+            grid = readers[path.suffix](path, crop)
+            grid = grid if crop is None else grid.crop(crop[:2], crop[2:])
+        except MemoryError:
+            raise ValueError("too little memory; read a part of it, see crop") from None
+    if crop is not None:
+        _warn_of_cut(grid, crop)
     if np.all(grid.occupied):
         warnings.warn(
             f"map '{path}': all of its {grid.occupied.size} cells are solid; expected free ones: "
@@ -153,6 +157,18 @@ def load_map(path: str | Path, *, crop: tuple[float, float, float, float] | None
             stacklevel=2,
         )
     return grid
+
+
+def _warn_of_cut(grid: Grid, crop: tuple[float, float, float, float]) -> None:
+    """Warn where the part that was read ends before the one that was asked for."""
+    low, high = grid.origin[:2], np.array(grid.origin[:2]) + grid.size[:2]
+    if np.any(low - np.array(crop[:2]) > RESOLUTION) or np.any(crop[2:] - high > RESOLUTION):
+        spans = f"{np.round(low, 3).tolist()} to {np.round(high, 3).tolist()}"
+        warnings.warn(
+            f"the crop {tuple(np.round(crop, 3).tolist())} reaches beyond the map; the part that "
+            f"is there spans {spans} m, and all around it is solid",
+            stacklevel=3,
+        )
 
 
 def coarsened(grid: Grid, resolution: float = RESOLUTION, *, cells: int | None = None) -> Grid:
@@ -232,16 +248,8 @@ def part_of(
 
 
 def _read_npz(path: Path, crop: tuple[float, float, float, float] | None) -> Grid:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = dict(data)
-    except MemoryError:
-        raise
-    except Exception as error:  # numpy and zipfile raise many kinds
-        raise ValueError(f"it is not a readable .npz file: {error}") from error
     known = ("occupied", "resolution_m", "origin_m")
-    if "occupied" not in arrays:
-        raise ValueError(f"it has no array 'occupied', only: {', '.join(arrays)}")
+    arrays = read_arrays(path, "occupied")
     if unknown := sorted({*arrays} - {*known}):
         raise ValueError(f"it has unknown arrays {', '.join(unknown)}; expected {', '.join(known)}")
     for name, array in arrays.items():
@@ -249,7 +257,7 @@ def _read_npz(path: Path, crop: tuple[float, float, float, float] | None) -> Gri
             raise ValueError(f"its {name} is of type {array.dtype}; expected numbers")
     origin, resolution = arrays.get("origin_m", np.zeros(3)), arrays.get("resolution_m", RESOLUTION)
     if np.size(resolution) != 1:
-        raise ValueError(f"its resolution_m is {resolution.tolist()}; expected one number")
+        raise ValueError(f"its resolution_m has shape {np.shape(resolution)}; expected one number")
     if np.shape(origin) not in ((2,), (3,)):
         raise ValueError(f"its origin_m has shape {np.shape(origin)}; expected (3,): x, y, z in m")
     grid = Grid(

@@ -7,6 +7,7 @@ import numpy as np
 
 from nrp_jax.homes.grid import HEIGHT, RESOLUTION, Grid
 from nrp_jax.homes.memory import check_memory
+from vrrt_jax.robots.xml_file import check_mjcf
 
 _KINDS = mujoco.mjtGeom
 _MEASURED = (
@@ -39,6 +40,7 @@ def read_mjcf_map(path: Path, crop: tuple[float, float, float, float] | None) ->
             cells are not known.
     """
     try:
+        check_mjcf(path)
         spec = mujoco.MjSpec.from_file(str(path))
         # A box that is moved to each cell; it must take nothing from the scene's defaults.
         probe = spec.worldbody.add_geom(

@@ -14,6 +14,7 @@ from PIL import Image, UnidentifiedImageError
 from nrp_jax.homes.grid import Grid, coarsened, part_of
 from nrp_jax.homes.memory import check_memory
 from vrrt_jax.core.data_file import read_yaml
+from vrrt_jax.core.pictures import open_picture
 
 _MODES = ("trinary", "scale", "raw")
 _FIELDS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
@@ -116,7 +117,7 @@ def _origin(value: Any) -> tuple[float, float]:
 def _number(value: Any, name: str) -> float:
     try:
         number = math.nan if isinstance(value, bool) else float(value)  # YAML reads 1e-2 as text
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
         raise ValueError(f"its {name} has {value!r}; expected a finite number")
@@ -139,7 +140,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise ValueError(f"its image '{path}' does not exist; expected it beside the YAML file")
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             if image.mode.startswith(("I", "F")):
                 raise ValueError(
                     f"its image has pixels of kind '{image.mode}'; expected 8 bits a pixel: "

@@ -2,8 +2,7 @@
 
 import dataclasses
 import json
-import zipfile
-import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nrp_jax.learning.models import CVAE, NEXT, Discriminator, ModelConfig
+from nrp_jax.learning.models import CVAE, NEXT, Discriminator, ModelConfig, check_choices
 from nrp_jax.learning.next_network import PlanningNetwork
+from vrrt_jax.core.arrays_file import MOST_WEIGHTS, float32_of, read_arrays
+from vrrt_jax.core.fields import record_of
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.precision import single_precision
 
@@ -73,25 +74,32 @@ def load_model(path: str | Path) -> Model:
     if not path.is_file():
         raise ValueError(f"no model at '{path}'; train one with: nrp train")
     try:
-        with np.load(path) as saved:
-            description = json.loads(str(saved["description"]))
-            if description["version"] != VERSION:
-                raise ValueError("another version")
-            flat = {
-                name.removeprefix("variables/"): jnp.asarray(saved[name], jnp.float32)
-                for name in saved.files
-                if name != "description"
-            }
-        # JSON has no tuples.
-        given = description["config"].items()
-        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given}
-        config, info = ModelConfig(**fields), description["info"]
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error):
+        arrays = read_arrays(path, "description", most=MOST_WEIGHTS)
+        description = json.loads(str(arrays.pop("description")))
+        if description["version"] != VERSION:
+            raise ValueError(f"it is of version {description['version']!r}, not {VERSION}")
+        config = record_of(ModelConfig, description["config"], "its config")
+        check_choices(config.task, config.kind, config.scope)
+        info = dict(description["info"])
+        variables = variables_of(arrays)
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(
-            f"'{path}' is not a readable model of this version; train it again with: nrp train"
+            f"'{path}' is not a readable model of this version ({error}); train it again with: nrp "
+            "train"
         ) from None
-    variables = flax.traverse_util.unflatten_dict(flat, sep="/")
     return Model(config=config, variables=variables, info=info)
+
+
+def variables_of(arrays: Mapping[str, np.ndarray]) -> Any:
+    """Flax variables of a file's arrays, whose names are paths.
+
+    Raises:
+        ValueError: an array is of another kind, or has values that no training leaves.
+    """
+    flat = {}
+    for name, array in arrays.items():
+        flat[name.removeprefix("variables/")] = jnp.asarray(float32_of(array, name))
+    return flax.traverse_util.unflatten_dict(flat, sep="/")
 
 
 def check_model(model: Model, path: str | Path, **expected: str) -> None:

@@ -20,12 +20,16 @@ from nrp_jax.learning.shards import (
     ROWS,
     VERSION,
     DatasetSettings,
+    Shard,
     checksum,
     make_shards,
     shard_name,
 )
 from vrrt_jax.core import command, workers
+from vrrt_jax.core.arrays_file import read_arrays
 from vrrt_jax.core.command import usable_cores
+from vrrt_jax.core.data_file import read_json
+from vrrt_jax.core.fields import check_fields, record_of
 from vrrt_jax.core.files import UNFINISHED, replacing
 from vrrt_jax.core.precision import single_precision
 
@@ -132,11 +136,11 @@ def load_dataset(folder: str | Path, split: str = "train") -> Dataset:
                 f"shard '{folder / name}' is missing or damaged; run `nrp data --task "
                 f"{settings.task} --out {folder}` with the same settings to make it again"
             )
-        with np.load(folder / name) as data:
-            grids.append(Grid(occupied=np.unpackbits(data["occupied"], axis=-1).astype(bool)
-                              [..., : int(data["layers"])]))  # fmt: skip
-            parts.append({key: data[key] for key in ROWS})
-            parts[-1]["home"] = np.full(len(data["ratio"]), home, np.int32)
+        data = read_arrays(folder / name, "occupied", "layers", *ROWS)
+        grids.append(Grid(occupied=np.unpackbits(data["occupied"], axis=-1).astype(bool)
+                          [..., : int(data["layers"])]))  # fmt: skip
+        parts.append({key: data[key] for key in ROWS})
+        parts[-1]["home"] = np.full(len(data["ratio"]), home, np.int32)
     rows = {key: np.concatenate([part[key] for part in parts]) for key in (*ROWS, "home")}
     return Dataset(settings=settings, grids=grids, rows=rows)
 
@@ -207,11 +211,14 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"no data set in '{folder}': {MANIFEST} is missing; run `nrp data`")
     try:
-        manifest = json.loads(path.read_text())
-        if not {"settings", "shards"} <= manifest.keys():
-            raise ValueError("settings or shards are missing")
-        DatasetSettings(**manifest["settings"])
-    except (ValueError, AttributeError, TypeError) as error:
+        manifest = read_json(path)
+        check_fields(manifest, ("settings", "rows", "shards"), "it")
+        record_of(DatasetSettings, manifest.get("settings", {}), "settings")
+        for name, entry in dict(manifest.get("shards", {})).items():
+            record_of(Shard, entry, f"the shard '{name}'")
+            if Path(name).name != name:
+                raise ValueError(f"the shard '{name}' is not in the folder")
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(
             f"'{path}' is not readable ({error}); remove the folder and write it again"
         ) from error

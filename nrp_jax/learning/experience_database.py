@@ -2,17 +2,16 @@
 
 import dataclasses
 import json
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import flax.traverse_util
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from nrp_jax.learning.checkpoint import variables_of
 from nrp_jax.learning.models import FIRE
+from vrrt_jax.core.arrays_file import MOST_WEIGHTS, float32_of, read_arrays
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.precision import single_precision
 
@@ -63,27 +62,25 @@ def load_database(path: str | Path, task: str) -> Database:
     if not path.is_file():
         raise ValueError(f"no database at '{path}'; make one with: nrp train --model {FIRE}")
     try:
-        with np.load(path) as saved:
-            description = json.loads(str(saved["description"]))
-            if (description["kind"], description["version"]) != (FIRE, VERSION):
-                raise ValueError("another kind or version")
-            prefix = "variables/"
-            flat = {
-                name.removeprefix(prefix): jnp.asarray(saved[name], jnp.float32)
-                for name in saved.files
-                if name.startswith(prefix)
-            }
-            latents, samples = (saved[n].astype(np.float32) for n in ("latents", "samples"))
-        found, info = description["task"], description["info"]
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error):
+        arrays = read_arrays(path, "description", "latents", "samples", most=MOST_WEIGHTS)
+        description = json.loads(str(arrays.pop("description")))
+        if (description["kind"], description["version"]) != (FIRE, VERSION):
+            raise ValueError("it is of another kind or version")
+        latents, samples = (float32_of(arrays.pop(n), n) for n in ("latents", "samples"))
+        if latents.ndim != 2 or samples.ndim != 2 or len(latents) != len(samples):
+            raise ValueError(f"its latents and samples are {latents.shape} and {samples.shape}")
+        if not len(latents):
+            raise ValueError("its latents are empty")
+        variables = variables_of(arrays)
+        found, info = description["task"], dict(description["info"])
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(
-            f"'{path}' is not a readable database of this version; make it again with: nrp train "
-            f"--model {FIRE}"
+            f"'{path}' is not a readable database of this version ({error}); make it again with: "
+            f"nrp train --model {FIRE}"
         ) from None
     if found != task:
         raise ValueError(
             f"'{path}' is a database of '{found}'; expected one of '{task}': give another file, or "
             f"make one with: nrp train --task {task} --model {FIRE}"
         )
-    variables = flax.traverse_util.unflatten_dict(flat, sep="/")
     return Database(task=found, variables=variables, latents=latents, samples=samples, info=info)

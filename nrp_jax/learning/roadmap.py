@@ -19,6 +19,8 @@ from scipy.spatial import cKDTree
 from nrp_jax.learning.edge_check import EDGE_BATCH, POINT_BATCH, check_edges, pad_rows
 from nrp_jax.scene.robots import MobileRobot, batch_link_features
 from nrp_jax.scene.world import GridWorld, batch_is_free
+from vrrt_jax.core.arrays_file import read_arrays
+from vrrt_jax.core.data_file import of_file
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.planners.rrt import sample_configurations
 from vrrt_jax.core.precision import single_precision
@@ -47,14 +49,19 @@ class Roadmap:
 
 @single_precision
 def load_roadmap(path: Path) -> Roadmap:
-    """Read a roadmap that :meth:`Roadmap.save` wrote."""
-    with np.load(path) as saved:
-        parts = (saved["data"], saved["indices"], saved["indptr"])
-        return Roadmap(
-            q=saved["q"],
-            lengths=sparse.csr_matrix(parts, shape=(len(saved["q"]),) * 2),
-            colliding=saved["colliding"],
-        )
+    """Read a roadmap that :meth:`Roadmap.save` wrote.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: it is damaged, or of another kind.
+    """
+    names = ("data", "indices", "indptr", "q", "colliding")
+    arrays = read_arrays(path, *names)
+    *parts, q, colliding = (arrays[name] for name in names)
+    with of_file(path):
+        lengths = sparse.csr_matrix(tuple(parts), shape=(len(q),) * 2)
+        lengths.check_format(full_check=True)
+    return Roadmap(q=q, lengths=lengths, colliding=colliding)
 
 
 @single_precision

@@ -42,6 +42,15 @@ class DatasetSettings:
     rows_version: int = VERSION
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Shard:
+    """A shard's entry in the manifest."""
+
+    rows: int
+    seed: int  # of the home
+    sha256: str
+
+
 def home_seed(settings: DatasetSettings, split: str, index: int) -> int:
     """Seed of a home; homes of different splits never share one."""
     return settings.seed * 10_000 + index + (FIRST_TEST_SEED if split == "test" else 0)

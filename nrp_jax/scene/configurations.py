@@ -19,7 +19,7 @@ def check_shape(robot: MobileRobot, q: Any, what: str) -> np.ndarray:
     """
     try:
         q = np.asarray(q, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"the {what} is {q!r}; expected numbers, one for each joint") from None
     if q.shape != (robot.num_joints,):
         names = ", ".join(robot.joint_names)

@@ -124,12 +124,12 @@ def test_a_folder_keeps_the_problem_and_the_tree(tmp_path):
         q=np.zeros((3, 7), np.float32), parent=np.array([-1, 0, 1]), score=np.array([3.0, 1.0, 2.0])
     )
     save_nodes(nodes, tmp_path / "tree.npz")
-    found = load_nodes(tmp_path / "tree.npz")
+    found = load_nodes(tmp_path / "tree.npz", 7)
     np.testing.assert_array_equal(found.parent, nodes.parent)
     assert found.best_edges(1).tolist() == [1] and found.best_edges(9).tolist() == [1, 2]
     (tmp_path / "tree.npz").write_bytes(b"PK")
-    with pytest.raises(ValueError, match="no readable tree"):
-        load_nodes(tmp_path / "tree.npz")
+    with pytest.raises(ValueError, match="no readable .npz"):
+        load_nodes(tmp_path / "tree.npz", 7)
     with pytest.raises(FileNotFoundError, match=r"has no result.json"):
         view_folder(tmp_path)
 

@@ -4,8 +4,6 @@ A file is a NumPy archive of ``N`` problems. ``docs/benchmarks.md`` lists its ke
 """
 
 import dataclasses
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from vrrt_jax.core.arrays_file import read_arrays
 from vrrt_jax.core.results_file import fingerprint
 from vrrt_jax.robots.mesh_sources import frozen_joints
 from vrrt_jax.robots.robot import Robot
@@ -121,19 +120,7 @@ def read_problems(
 
 def _read(file: Path) -> dict[str, np.ndarray]:
     """The arrays of a file, with keys, types and shapes checked."""
-    try:
-        archive = np.load(file, allow_pickle=False)
-        if isinstance(archive, np.ndarray):
-            raise ValueError("it is a single array")
-        with archive:
-            arrays = {key: archive[key] for key in archive.files}
-    except FileNotFoundError:
-        raise FileNotFoundError(f"no problems at '{file}'; give a .npz file") from None
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(
-            f"'{file}' is no NumPy archive of plain arrays ({error}); expected one that "
-            "numpy.savez wrote"
-        ) from None
+    arrays = read_arrays(file)
     known = KEYS | OPTIONAL_KEYS
     missing, unknown = [k for k in KEYS if k not in arrays], [k for k in arrays if k not in known]
     if missing or unknown:

@@ -21,7 +21,7 @@ from vrrt_jax.bench.dream_data import Frame
 from vrrt_jax.bench.dream_table import summarize
 from vrrt_jax.bench.tasks import bench_robot, bench_world, level_name
 from vrrt_jax.config import PlannerConfig
-from vrrt_jax.core.data_file import read_fields
+from vrrt_jax.core.data_file import of_file, read_fields
 from vrrt_jax.core.interrupt import uninterrupted
 from vrrt_jax.core.results_file import fingerprint, plain, resume, write
 from vrrt_jax.core.timing import machine, versions
@@ -158,7 +158,8 @@ def _check(benchmark: DreamBenchmark) -> None:
         raise ValueError(f"got levels {list(benchmark.levels)}; expected distances below pi [rad]")
     bench_world(benchmark.robot, "", benchmark.engine)  # a name of an engine that is unknown
     if benchmark.extrinsics is not None:
-        world_to_camera(_pose_fields(benchmark.extrinsics))
+        with of_file(benchmark.extrinsics):
+            world_to_camera(_pose_fields(benchmark.extrinsics))
     if benchmark.mask == "file":
         folder = Path(benchmark.folder)
         bare = [f for f in benchmark.frames if not (folder / (f + dream_data.MASK)).is_file()]

@@ -1,6 +1,5 @@
 """Benchmark results as tables and figures, beside the paper's own numbers."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ import numpy as np
 
 from vrrt_jax.bench.methods import CAUSES, METHODS
 from vrrt_jax.bench.tasks import ROBOTS
+from vrrt_jax.core.data_file import of_results, read_json
 from vrrt_jax.core.files import write_text
 from vrrt_jax.core.markdown import table
 
@@ -23,6 +23,7 @@ PAPER_NOTE = (
     "an NVIDIA RTX 4090; 21.6 s a plan for the Panda."
 )
 CAUSE_COLORS = ("#4878a8", "#d9903d", "#ecc68f", "#8a8a8a", "#c4c4c4", "#7a5aa6", "#b5433f")
+_NONE = "{} is no results file of vrrt bench"
 SOLVED_COLOR = "#8fbc8f"
 
 
@@ -78,9 +79,16 @@ def write_page(files: Sequence[Path], folder: Path) -> Path:
     """Write ``README.md`` and its figures for results of any number of benchmarks.
 
     Raises:
+        FileNotFoundError: a file is missing.
         ValueError: a file is no results file.
     """
     found = [_read(file) for file in files]
+    with of_results(_NONE.format(" or ".join(f"'{file}'" for file in files))):
+        return _written(found, folder)
+
+
+def _written(found: Sequence[dict[str, Any]], folder: Path) -> Path:
+    """The page, of files that are read."""
     parts = ["# Results", "", PAPER_NOTE, "", "## Average success [%]", "", _overview(found), ""]
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for results in found:
@@ -106,12 +114,19 @@ def write_page(files: Sequence[Path], folder: Path) -> Path:
 
 
 def _read(file: Path) -> dict[str, Any]:
-    try:
-        results = json.loads(file.read_text())
-        _variants(results)
-        return results
-    except (OSError, ValueError, KeyError) as error:
-        raise ValueError(f"'{file}' is no results file of vrrt bench: {error!r}") from None
+    """The results of a file, all of which can be told.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no results file.
+    """
+    results = read_json(file)
+    with of_results(_NONE.format(f"'{file}'")):
+        if not isinstance(results["what"] + results["robot"], str):
+            raise ValueError("its names are no texts")
+        to_text(results)
+        _command(results)
+    return results
 
 
 def _variants(results: dict[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,10 @@
 """Fields of JSON files: all must be known, so that none is ignored in silence."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, get_args, get_origin, get_type_hints
+
+MOST = 2**53  # beyond it numbers of files are not whole any more
 
 
 def check_fields(
@@ -25,3 +28,55 @@ def check_fields(
         f"{what} has unknown fields: {', '.join(map(str, unknown))}; known ones: {', '.join(known)}"
         + "".join(f"; {text}" for text in told if text)
     )
+
+
+def record_of(kind: type[Any], fields: Any, what: str) -> Any:
+    """A dataclass from the fields of a file, with their types checked.
+
+    Args:
+        kind: the dataclass; lists become its tuples, and whole numbers its floats.
+        fields: what the file holds.
+        what: the object's name in errors.
+
+    Raises:
+        ValueError: a field is missing, unknown or of another type.
+    """
+    own = {field.name: field for field in dataclasses.fields(kind) if field.init}
+    check_fields(fields, tuple(own), what)
+    values = {}
+    for name, expected in get_type_hints(kind).items():
+        if name not in own:
+            continue
+        if name not in fields:
+            if own[name].default is dataclasses.MISSING:
+                raise ValueError(f"{what} lacks the field {name}")
+            continue
+        values[name] = value = _as(expected, fields[name])
+        if value is _OTHER:
+            told = _WORDS.get(get_origin(expected) or expected, expected)
+            raise ValueError(f"{what} has {name} {fields[name]!r}; expected {told}")
+    return kind(**values)
+
+
+_WORDS = {
+    **{int: "a whole number", float: "a number", bool: "true or false", str: "a text"},
+    **{tuple: "a list", Mapping: "an object"},
+}
+_OTHER = object()  # a value of another type
+
+
+def _as(expected: Any, value: Any) -> Any:
+    """The value as the type has it; ``_OTHER`` if it is of another one."""
+    outer, inner = get_origin(expected) or expected, get_args(expected)
+    if outer is Any:
+        return value
+    if outer is tuple:
+        parts = [_as(inner[0], part) for part in value] if isinstance(value, list) else [_OTHER]
+        return _OTHER if any(part is _OTHER for part in parts) else tuple(parts)
+    if outer is float and type(value) in (int, float):
+        return float(value) if abs(value) < MOST else _OTHER
+    if outer is int and type(value) is int:
+        return value if abs(value) < MOST else _OTHER
+    if outer in (int, float, bool):
+        return value if type(value) is outer else _OTHER
+    return value if isinstance(value, outer) else _OTHER

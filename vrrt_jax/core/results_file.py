@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from vrrt_jax.core.data_file import check_file, read_json, read_text
 from vrrt_jax.core.files import replacing
 
 
@@ -26,8 +27,11 @@ def resume(file: Path, header: Mapping[str, Any], fresh: dict[str, Any]) -> dict
         write(file, fresh)  # a bad path is told before hours of work
         return fresh
     try:
-        results = json.loads(file.read_text())
+        results = read_json(file)
         old = {name: results[name] for name in header}
+        missing = [name for name in fresh if name not in results]
+        if missing or any(type(results[name]) is not type(fresh[name]) for name in fresh):
+            raise ValueError(f"it lacks {', '.join(missing) or 'what a run writes'}")
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"'{file}' is no results file of this version ({error!r}); choose another --json"
@@ -50,7 +54,7 @@ def resume_rows(file: Path, header: Mapping[str, Any]) -> list[dict[str, Any]]:
         ValueError: the file is none of this kind, or of another benchmark, version or seed.
         OSError: the file cannot be written.
     """
-    text = file.read_text() if file.exists() else ""
+    text = read_text(file, "JSON lines") if file.exists() else ""
     whole = text[: text.rfind("\n") + 1]
     if whole != text:
         with replacing(file, "w") as handle:
@@ -61,7 +65,9 @@ def resume_rows(file: Path, header: Mapping[str, Any]) -> list[dict[str, Any]]:
     try:
         old, *rows = [json.loads(line) for line in whole.splitlines()]
         old = {name: old[name] for name in header}
-    except (ValueError, KeyError, TypeError) as error:
+        if not all(isinstance(row, dict) for row in rows):
+            raise ValueError("a row is no object")
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(
             f"'{file}' holds no rows of this version ({error!r}); choose another --json"
         ) from None
@@ -105,8 +111,12 @@ def write(file: Path, results: Mapping[str, Any]) -> None:
 
 
 def fingerprint(file: Path) -> str:
-    """Of what is in a file."""
-    return hashlib.sha256(file.read_bytes()).hexdigest()[:12]
+    """Of what is in a file.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    return hashlib.sha256(check_file(file).read_bytes()).hexdigest()[:12]
 
 
 def plain(fields: Mapping[str, Any]) -> dict[str, Any]:

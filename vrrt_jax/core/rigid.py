@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+_LARGEST = 1e9  # [m] beyond it products overflow
 NOT_A_ROTATION = 3e-3  # how far a rotation is off if it is written with three decimals
 
 
@@ -19,7 +20,7 @@ def rigid(transform: Any, what: str) -> np.ndarray:
     """
     try:
         matrix = np.asarray(transform, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{what} is not made of numbers; expected 4 rows of 4") from None
     if matrix.shape != (4, 4):
         raise ValueError(
@@ -34,7 +35,7 @@ def rigid(transform: Any, what: str) -> np.ndarray:
         )
     rotation = matrix[:3, :3]
     if (
-        not np.all(np.isfinite(matrix))
+        not np.all(np.abs(matrix) < _LARGEST)
         or not np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=NOT_A_ROTATION)
         or np.linalg.det(rotation) < 0
     ):

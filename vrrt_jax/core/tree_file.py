@@ -1,11 +1,11 @@
 """The nodes of a search tree on the host, and as a small file."""
 
 import dataclasses
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from vrrt_jax.core.arrays_file import read_arrays
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.types import Tree
 
@@ -42,8 +42,8 @@ def save_nodes(nodes: Nodes, path: Path) -> None:
         np.savez_compressed(file, **{name: getattr(nodes, name) for name in _FIELDS})
 
 
-def load_nodes(path: Path) -> Nodes:
-    """Read what :func:`save_nodes` wrote.
+def load_nodes(path: Path, num_joints: int) -> Nodes:
+    """Read what :func:`save_nodes` wrote of a robot with so many joints.
 
     Raises:
         FileNotFoundError: no such file.
@@ -51,11 +51,18 @@ def load_nodes(path: Path) -> Nodes:
     """
     if not path.is_file():
         raise FileNotFoundError(f"no tree at '{path}'; plan again to write one")
-    try:
-        with np.load(path) as file:
-            return Nodes(**{name: file[name] for name in _FIELDS})
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"'{path}' is no readable tree ({error}); plan again") from None
+    arrays = read_arrays(path, *_FIELDS)
+    q, parent, score = (arrays[name] for name in _FIELDS)
+    num = len(q) if q.ndim == 2 and q.shape[1] == num_joints else -1
+    is_tree = q.dtype.kind == score.dtype.kind == "f" and parent.dtype.kind == "i"
+    is_tree = is_tree and parent.shape == score.shape == (num,) and np.isfinite(q).all()
+    if not is_tree or np.any((parent < -1) | (parent >= num)) or np.isnan(score).any():
+        shapes = ", ".join(f"{name} {arrays[name].shape}" for name in _FIELDS)
+        raise ValueError(
+            f"'{path}' is no tree; expected q (N, {num_joints}), parent (N,) of its nodes and "
+            f"score (N,), got {shapes}; plan again"
+        )
+    return Nodes(q=q, parent=parent, score=score)
 
 
 _FIELDS = tuple(field.name for field in dataclasses.fields(Nodes))

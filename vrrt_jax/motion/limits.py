@@ -108,7 +108,7 @@ def motion_limits(robot: Robot, given: MotionLimits | None = None) -> MotionLimi
 def _checked(robot: Robot, kind: str, value: Any) -> np.ndarray:
     try:
         limits = np.broadcast_to(np.asarray(value, float), robot.num_joints).copy()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         limits = np.array([np.nan])
     if not (np.isfinite(limits).all() and (limits > 0).all()):
         raise ValueError(

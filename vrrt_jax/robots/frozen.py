@@ -8,22 +8,31 @@ import numpy as np
 
 from vrrt_jax.robots.couplings import follow
 
+_ROUNDING = 1e-4  # [rad] or [m] that files with few decimals may be beyond a limit
+
 
 def home_positions(model: mujoco.MjModel) -> dict[str, float]:
     """Joint positions [rad] or [m] of the keyframe 'home', else of the first, else of the zero.
 
-    All are clipped to the limits.
+    All are put inside the limits; where a keyframe is outside of them, a warning says so.
     """
     names = [model.key(k).name for k in range(model.nkey)]
     qpos = model.qpos0
     if names:
         qpos = model.key_qpos[names.index("home") if "home" in names else 0]
-    home = {}
+    home, moved = {}, []
     for j in range(model.njnt):
-        position = qpos[model.jnt_qposadr[j]]
-        if model.jnt_limited[j]:
-            position = np.clip(position, *model.jnt_range[j])
-        home[model.joint(j).name] = float(position)
+        name, stated = model.joint(j).name, qpos[model.jnt_qposadr[j]]
+        position = np.clip(stated, *model.jnt_range[j]) if model.jnt_limited[j] else stated
+        if names and abs(position - stated) > _ROUNDING:
+            moved.append(f"{name} is at {stated:g}, and its range ends at {position:g}")
+        home[name] = float(position)
+    if moved:
+        warnings.warn(
+            f"the keyframe for home is outside of the limits: {'; '.join(moved)}; it is moved "
+            "there: correct the keyframe",
+            stacklevel=3,
+        )
     return home
 
 
@@ -52,7 +61,7 @@ def frozen_positions(
             raise ValueError(f"freeze: joint '{name}' not in robot; have: {', '.join(names)}")
         try:
             frozen[name] = float(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             frozen[name] = np.nan
         if not np.isfinite(frozen[name]):
             raise ValueError(

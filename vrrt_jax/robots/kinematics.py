@@ -7,6 +7,7 @@ XLA has no fast path for batches of 4x4 matrices (13 times slower for 1,024 conf
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -61,16 +62,25 @@ class BodySpheres:
 
 
 @single_precision
-def link_poses(chain: Chain, q: jax.Array) -> jax.Array:
+def link_poses(chain: Any, q: jax.Array) -> jax.Array:
     """World poses of all links.
 
     Args:
-        chain: from :func:`chain_from_model`.
+        chain: a robot or a world, or the :class:`Chain` of one.
         q: (D,) joint positions [rad] or [m].
 
     Returns:
         (L, 4, 4) link-to-world transforms.
+
+    Raises:
+        ValueError: q has another shape, which is known while functions are traced too.
     """
+    chain, q = getattr(chain, "chain", chain), jnp.asarray(q)
+    if q.shape != (len(chain.parents),):
+        raise ValueError(
+            f"q has shape {q.shape}; expected ({len(chain.parents)},), a number for each joint; "
+            "jax.vmap takes several"
+        )
     angle = q[:, None, None]
     local = (
         chain.constant

@@ -3,12 +3,12 @@
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
 from vrrt_jax.robots.urdf import bad_urdf_joints, urdf_root
+from vrrt_jax.robots.xml_file import xml_root
 
 _LARGEST = 1e3  # [rad] or [m] a larger limit stands for none, and angles would lose their digits
 _MANY_TURNS = 8 * np.pi  # [rad] a larger limit of a hinge may be meant in degrees
@@ -58,9 +58,8 @@ def _words(low: float, high: float) -> str:
 
 def _zero_ranges(path: Path) -> list[str]:
     """Names of the joints of an MJCF file, and of those it includes, whose range is 0 0."""
-    try:
-        root = ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, OSError):
+    root = xml_root(path) if path.is_file() else None
+    if root is None:
         return []
     found = []
     for joint in root.iter("joint"):

@@ -9,6 +9,7 @@ import numpy as np
 
 from vrrt_jax.robots import urdf
 from vrrt_jax.robots.names import free_name
+from vrrt_jax.robots.xml_file import check_mjcf
 
 _TOOL = "tool_"  # two models may use a name twice
 _WRAPS_JOINT = mujoco.mjtWrap.mjWRAP_JOINT
@@ -29,6 +30,7 @@ def read_spec(path: Path, *, visuals: bool = False) -> mujoco.MjSpec:
     try:
         root = urdf.urdf_root(path)
         if root is None:
+            check_mjcf(path)
             spec = _plain(mujoco.MjSpec.from_file(str(path)))
             if visuals and _tells_apart(spec):
                 _hide_what_collides(spec)
@@ -60,6 +62,7 @@ def read_inertial_spec(path: Path) -> mujoco.MjSpec:
     try:
         root = urdf.urdf_root(path)
         if root is None:
+            check_mjcf(path)
             return _named(mujoco.MjSpec.from_file(str(path)))
         return _named(urdf.urdf_spec(root, path, visuals=False))
     except ValueError as error:

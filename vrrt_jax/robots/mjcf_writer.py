@@ -2,12 +2,15 @@
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import mujoco
 import numpy as np
 
+from vrrt_jax.core.data_file import read_text
 from vrrt_jax.robots.kinematics import BodySpheres
 from vrrt_jax.robots.names import free_name
+from vrrt_jax.robots.xml_file import check_mjcf
 
 # Robot spheres of two kinds and obstacles (contype=1 conaffinity=0) share a model. MuJoCo checks
 # a pair where one's contype meets the other's conaffinity: collision spheres against obstacles,
@@ -81,9 +84,31 @@ def collision_mjcf(
 
 def renamed(text: str, name: str) -> str:
     """A written model under another name of the robot."""
-    root = ET.fromstring(text, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
+    root = ET.fromstring(text, _with_comments())
     root.set("model", name)
     return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def check_written(path: str | Path) -> None:
+    """Raise a ValueError for a file that :func:`replace_spheres` cannot use.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+    """
+    check_mjcf(path)
+    try:
+        root = ET.fromstring(read_text(path, "XML"), _with_comments())
+    except ET.ParseError as error:
+        raise ValueError(f"it is no XML: {error}") from None
+    tags = [part.tag for part in root]
+    if not {ET.Comment, "contact", "worldbody"} <= {*tags}:
+        raise ValueError(
+            "it lacks a comment, <contact> or <worldbody>; expected a file that vrrt spheres wrote"
+        )
+
+
+def _with_comments() -> ET.XMLParser:
+    return ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))
 
 
 def replace_spheres(text: str, fitted: str) -> str:
@@ -98,10 +123,7 @@ def replace_spheres(text: str, fitted: str) -> str:
     Raises:
         ValueError: the bodies have other names.
     """
-    root, other = (
-        ET.fromstring(model, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
-        for model in (text, fitted)
-    )
+    root, other = (ET.fromstring(model, _with_comments()) for model in (text, fitted))
     bodies, others = (
         {body.get("name"): body for body in tree.iter() if body.tag in ("worldbody", "body")}
         for tree in (root, other)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from vrrt_jax.core.data_file import of_file
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots import frozen as frozen_joints
 from vrrt_jax.robots import limits, mjcf, mjcf_writer, self_collision
@@ -82,6 +83,11 @@ def load_robot(name_or_path: str | Path, *, freeze: Mapping[str, float] | None =
             that does not exist or puts one outside of its range.
     """
     path = robot_path(name_or_path)
+    with of_file(path):
+        return _loaded(name_or_path, path, freeze)
+
+
+def _loaded(name_or_path: str | Path, path: Path, freeze: Mapping[str, float] | None) -> Robot:
     spec = mjcf.read_spec(path)
     model, home, frozen = _reduce(spec, path, freeze)
     spheres = spheres_of(model)

@@ -12,7 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vrrt_jax.core.fields import check_fields
+from vrrt_jax.core.data_file import check_file, read_json
+from vrrt_jax.core.fields import record_of
 from vrrt_jax.core.files import replacing
 
 FORMAT = 1
@@ -37,7 +38,7 @@ class Record:
 
 def sha256(file: Path) -> str:
     """A fingerprint of a file's bytes."""
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+    return hashlib.sha256(check_file(file).read_bytes()).hexdigest()
 
 
 def write_record(folder: Path, record: Record) -> None:
@@ -60,21 +61,19 @@ def read_record(folder: Path) -> Record:
             f"'{folder}' is no robot's folder: it has no {RECORD}; make one with: vrrt fit"
         )
     try:
-        fields = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"'{file}' is not valid JSON: {error}; {again}") from None
+        fields = read_json(file)
+    except ValueError as error:
+        raise ValueError(f"{error}; {again}") from None
     found = fields.get("format") if isinstance(fields, dict) else None
     if found != FORMAT:
         raise ValueError(f"'{file}' has format {found}, expected {FORMAT}; {again}")
     names = [field.name for field in dataclasses.fields(Record)]
-    check_fields(fields, names, f"'{file}', made by another version or by hand ({again}),")
     if missing := [name for name in names if name not in fields]:
         raise ValueError(f"'{file}' lacks the field {', '.join(missing)}; {again}")
-    record = Record(**fields)
-    made_of, rounds = record.made_of, record.rounds
-    if type(rounds) is not int or rounds < 0:
-        raise ValueError(f"'{file}': rounds is {rounds!r}; expected a whole number; {again}")
-    if not isinstance(made_of, dict) or not isinstance(made_of.get("source"), str):
+    record = record_of(Record, fields, f"'{file}', made by another version or by hand ({again}),")
+    if record.rounds < 0:
+        raise ValueError(f"'{file}': rounds is {record.rounds}; expected 0 or more; {again}")
+    if not isinstance(record.made_of.get("source"), str):
         raise ValueError(f"'{file}' does not say what the robot was made of; {again}")
     if not (folder / MODEL).is_file():
         raise FileNotFoundError(f"'{folder}' has no {MODEL}; {again}")

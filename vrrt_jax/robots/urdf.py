@@ -1,5 +1,6 @@
 """What MuJoCo does not do with a URDF file: find its meshes, and mind what its limits say."""
 
+import os
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,6 +9,8 @@ from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
+
+from vrrt_jax.robots.xml_file import check_number, xml_root
 
 _PACKAGES = ("package://", "model://", "$(find ")  # before the name of a package
 _FILE = "file://"
@@ -25,11 +28,11 @@ def urdf_root(path: Path) -> ElementTree.Element | None:
     """The root of a URDF file; None for a file of another kind.
 
     Raises:
-        ValueError: it is a xacro file, which only becomes a URDF.
+        FileNotFoundError: no such file.
+        ValueError: it is a xacro file, which only becomes a URDF, or declares entities.
     """
-    try:
-        root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError:
+    root = xml_root(path)
+    if root is None:
         return None
     for element in root.iter():
         if str(element.tag).startswith(_XACRO):
@@ -60,7 +63,13 @@ def urdf_spec(root: ElementTree.Element, path: Path, *, visuals: bool) -> mujoco
         limit = joint.find("limit")
         if limit is not None and joint.get("type") in _LIMITED and _NAMES & set(limit.keys()):
             for name in sorted(_NAMES):
-                limit.set(name, limit.get(name, "0"))  # MuJoCo takes one alone for none at all
+                # MuJoCo takes one alone for none at all. NaN is told of later.
+                text = limit.get(name, "0")
+                limit.set(name, "0" if text.strip().lower() == "nan" else text)
+    for part in root.iter():
+        for key, text in part.attrib.items():
+            check_number(part, key, text)
+    _narrow_to_soft_limits(root)
     compiler.set("discardvisual", "false" if visuals else "true")
     folder = path.resolve().parent
     packages = {_package(mesh.get("filename", "")) for _, _, mesh in _meshes(root)} - {""}
@@ -69,7 +78,7 @@ def urdf_spec(root: ElementTree.Element, path: Path, *, visuals: bool) -> mujoco
             continue
         name = mesh.get("filename", "")
         places = list(_places(name, folder, compiler.get("meshdir", "")))
-        there = next((place for place in places if place.is_file()), None)
+        there = next((place for place in places if os.path.isfile(place)), None)
         if there is None:
             raise ValueError(_not_found(name, link, places))
         if there.suffix.lower() not in _READ:
@@ -106,6 +115,46 @@ def _check_tree(root: ElementTree.Element) -> None:
             f"the links {', '.join(map(str, roots))} are children of no joint; expected one such "
             "link, the base: add the joints that carry the others"
         )
+
+
+def _narrow_to_soft_limits(root: ElementTree.Element) -> None:
+    """Put soft limits, where a controller stops the joint, in place of wider ones, in place."""
+    for joint in root.findall("joint"):
+        soft, limit = joint.find("safety_controller"), joint.find("limit")
+        if soft is None or limit is None or joint.get("type") not in _LIMITED:
+            continue
+        hard = [_limit(limit, name) for name in ("lower", "upper")]
+        ends = [_limit(soft, f"soft_{name}_limit") for name in ("lower", "upper")]
+        if not np.isfinite(ends).all():
+            raise ValueError(
+                f"joint '{joint.get('name', '')}' has the soft limits {ends} in its "
+                "safety_controller; expected two numbers, or no safety_controller"
+            )
+        low, high = max(hard[0], ends[0]), min(hard[1], ends[1])
+        if ends == [0.0, 0.0] or [low, high] == hard:  # left out, they are 0
+            continue
+        name = joint.get("name", "")
+        if not low < high:
+            raise ValueError(
+                f"joint '{name}' has the soft limits {ends} in its safety_controller, of which "
+                f"none is inside its limits {hard}; correct them, or remove the safety_controller"
+            )
+        warnings.warn(
+            f"joint '{name}' is planned within [{low:g}, {high:g}], the soft limits of its "
+            f"safety_controller, not within its limits {hard}; remove the safety_controller to "
+            "plan up to these",
+            stacklevel=7,
+        )
+        limit.set("lower", repr(low))
+        limit.set("upper", repr(high))
+
+
+def _limit(element: ElementTree.Element, name: str) -> float:
+    """A limit; 0 where it is left out, and NaN for what is no number, of which others tell."""
+    try:
+        return float(element.get(name) or 0.0)
+    except ValueError:
+        return np.nan
 
 
 def _meshes(root: ElementTree.Element) -> Iterator[tuple[str, str, ElementTree.Element]]:

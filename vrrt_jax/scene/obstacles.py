@@ -19,6 +19,7 @@ import numpy as np
 from vrrt_jax.core.files import write_text
 from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.names import free_name
+from vrrt_jax.robots.xml_file import check_mjcf
 from vrrt_jax.scene.obstacle_kinds import KINDS, SlotShape
 
 PARKED = 1e3  # [m] where the empty slots are
@@ -79,10 +80,7 @@ def load_obstacles(path: str | Path) -> list[Obstacle]:
         ValueError: not MJCF, a body that moves, or a geom of another kind.
     """
     try:
-        Path(path).read_bytes()
-    except OSError as error:
-        raise FileNotFoundError(f"cannot read the world '{path}': {error.strerror}") from None
-    try:
+        check_mjcf(path)
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise ValueError(f"'{path}' is not a valid MJCF world: {error}") from None
@@ -237,7 +235,7 @@ def _numbers(values: Any) -> np.ndarray:
     """Numbers as an array; NaN for what is none."""
     try:
         return np.asarray(values, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return np.array(np.nan)
 
 

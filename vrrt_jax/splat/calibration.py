@@ -41,6 +41,7 @@ MODELS = {
     "equidistant": (FISHEYE, LENGTHS[FISHEYE]),
     "fisheye": (FISHEYE, LENGTHS[FISHEYE]),
 }
+ALIKE = 0.03  # how far the shares of x and y are apart at most, if an image was scaled
 MIDDLE = 0.05, 0.95  # where principal points are, in units of the image
 NO_MODEL = ("", "none")  # as ROS says it of cameras without distortion
 ADVICE = {
@@ -196,6 +197,16 @@ def _check_middle(matrix: np.ndarray, read: Mapping[str, Any]) -> None:
         raise ValueError(
             f"camera_matrix has its principal point at {matrix[:2, 2].tolist()}, at the rim of an "
             f"image of {size[0]:g}x{size[1]:g} px or outside; give the calibration of this size"
+        )
+    # In a matrix of an image of half the size, both halves are quarters.
+    x, y = matrix[:2, 2] / size
+    times = round(0.5 / min(x, y))
+    if times > 1 and abs(x - y) < ALIKE and abs(times * (x + y) - 1) < ALIKE * times:
+        raise ValueError(
+            f"camera_matrix has its principal point at {matrix[:2, 2].tolist()}, as in the middle "
+            f"of an image of 1/{times} of {size[0]:g}x{size[1]:g} px; give image_width and "
+            'image_height of the image that it was calibrated with, and "image_scale" if yours has '
+            "another size"
         )
 
 

@@ -40,7 +40,7 @@ def _numbers(value: Any, name: str) -> np.ndarray:
         array = array if shape is None else array.reshape(shape)
     except KeyError as error:
         raise ValueError(f"{name} lacks {error}; expected rows, cols and data") from None
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(
             f"{name} is no matrix; expected lists of numbers, or rows, cols and data that fit"
         ) from None

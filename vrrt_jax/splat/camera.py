@@ -17,7 +17,8 @@ from vrrt_jax.splat.types import Camera
 MIN_FOVY_DEG, MAX_FOVY_DEG = 4.0, 150.0
 MAX_ASPECT = 2.0  # ratio of the two focal lengths
 MAX_DISTANCE_M = 100.0  # from the world's origin; farther ones are in mm
-USUAL_CENTRE = 0.1, 0.9  # in units of the image; elsewhere it may be of another image
+_LARGEST = 1e9  # of any number of a camera
+USUAL_CENTRE = 0.3, 0.7  # in units of the image; elsewhere it may be of another image
 
 
 @single_precision
@@ -146,9 +147,9 @@ def _vector(values: Any, length: int, what: str) -> np.ndarray:
     """Finite numbers (length,) in float64, or a ValueError."""
     try:
         vector = np.asarray(values, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         vector = np.array(np.nan)
-    if vector.shape != (length,) or not np.all(np.isfinite(vector)):
+    if vector.shape != (length,) or not np.all(np.abs(vector) < _LARGEST):
         raise ValueError(f"{what} is {values!r}; expected {length} finite numbers")
     return vector
 

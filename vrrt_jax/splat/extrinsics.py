@@ -84,7 +84,7 @@ def _numbers(value: Any, axes: str, what: str) -> np.ndarray:
         value = [value.get(axis) for axis in axes]
     try:
         numbers = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.array(np.nan)
     if numbers.shape != (len(axes),) or not np.all(np.isfinite(numbers)):
         raise ValueError(f"{what} is {value!r}; expected {len(axes)} finite numbers: {axes}")

@@ -12,6 +12,7 @@ import numpy as np
 import optax
 from tqdm import tqdm
 
+from vrrt_jax.core.arrays_file import read_arrays
 from vrrt_jax.core.files import replacing
 from vrrt_jax.robots.kinematics import Chain, link_poses
 from vrrt_jax.splat.fit_config import LevelConfig
@@ -177,7 +178,7 @@ def _store_checkpoint(file: Path, change, state, steps: int) -> None:
 def restore_checkpoint(file: Path, change, state):
     """Changes, optimizer's state and number of steps done; the arguments give the structure."""
     structure = jax.tree.structure((change, state))
-    with np.load(file) as saved:
-        leaves = [jnp.asarray(saved[f"leaf_{i}"]) for i in range(structure.num_leaves)]
-        change, state = jax.tree.unflatten(structure, leaves)
-        return change, state, int(saved["steps"])
+    names = [f"leaf_{i}" for i in range(structure.num_leaves)]
+    saved = read_arrays(file, "steps", *names)
+    change, state = jax.tree.unflatten(structure, [jnp.asarray(saved[name]) for name in names])
+    return change, state, int(saved["steps"])

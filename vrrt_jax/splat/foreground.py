@@ -148,7 +148,7 @@ def checked_box(box: Sequence[float], height: int, width: int) -> tuple[float, .
     """The box x0, y0, x1, y1 [px] in an image, or a ValueError."""
     try:
         values = np.asarray(box, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         values = np.array(np.nan)
     if values.shape != (4,) or not np.all(np.isfinite(values)):
         raise ValueError(f"the box is {box!r}; expected four numbers x0, y0, x1, y1 in pixels")

@@ -2,13 +2,13 @@
 
 import dataclasses
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from vrrt_jax.core.arrays_file import MOST_WEIGHTS, float32_of, read_arrays
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.splat.types import SplatModel
@@ -100,42 +100,64 @@ def load_self_model(path: str | Path) -> SelfModel:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no self-model at '{path}'; train one with: vrrt fit")
+    arrays = read_arrays(path, "header", most=MOST_WEIGHTS)
     try:
-        with np.load(path) as file:
-            arrays = {name: file[name] for name in file.files}
         header = json.loads(str(arrays["header"]))
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        if header["format"] != FORMAT:
+            raise ValueError(f"it has self-model format {header['format']!r}, expected {FORMAT}")
+        names = tuple(header["joint_names"])
+        levels = {
+            name: _level(name, numbers, arrays, 1 + len(names))
+            for name, numbers in header["levels"].items()
+        }
+        close_up = levels.pop(CLOSE_UP)
+        if not levels or not all(isinstance(name, str) for name in (header["robot"], *names)):
+            raise ValueError("its header lacks levels, or names")
+        return SelfModel(
+            robot=header["robot"],
+            joint_names=names,
+            levels=tuple(levels.values()),
+            close_up=close_up,
+            seed=header["seed"],
+            info=header["info"],
+        )
+    except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
+        what = f"it lacks {error}" if isinstance(error, KeyError) else error
         raise ValueError(
-            f"'{path}' is not a readable self-model ({error}); train it again with: vrrt fit"
+            f"'{path}' is not a readable self-model ({what}); train it again with: vrrt fit"
         ) from None
-    if header.get("format") != FORMAT:
-        raise ValueError(
-            f"'{path}' has self-model format {header.get('format')}, expected {FORMAT}; train it "
-            "again with: vrrt fit"
-        )
-    levels = {
-        name: Level(
-            splats=SplatModel(
-                **{
-                    field: jnp.asarray(
-                        arrays[f"{name}/{array}"], jnp.int32 if array == "link" else jnp.float32
-                    )
-                    for field, array in ARRAYS.items()
-                },
-                starts=tuple(numbers["starts"]),
-            ),
-            size_px=numbers["size_px"],
-            psnr_db=numbers["psnr_db"],
-            match_threshold=numbers["match_bar"],
-        )
-        for name, numbers in header["levels"].items()
-    }
-    close_up = levels.pop(CLOSE_UP)
-    return SelfModel(
-        robot=header["robot"],
-        joint_names=tuple(header["joint_names"]),
-        levels=tuple(levels.values()),
-        close_up=close_up,
-        seed=header["seed"],
-        info=header["info"],
+
+
+def _level(
+    name: str, numbers: dict[str, Any], arrays: dict[str, np.ndarray], num_links: int
+) -> Level:
+    """A level of a file.
+
+    Raises:
+        KeyError: a part is missing.
+        ValueError: it has another shape, or values that no training leaves.
+    """
+    found = {}
+    for field, array in ARRAYS.items():
+        value = float32_of(arrays[f"{name}/{array}"], f"{name}/{array}")
+        found[field] = value = value.astype(np.int32) if array == "link" else value
+        if value.shape != (found["mean"].shape[:1], ())[array == "tau"] + (3,) * (
+            array in ("mean", "rgb", "shade")
+        ):
+            raise ValueError(f"its {name}/{array} has shape {value.shape}")
+    link, starts = found["link"], tuple(numbers["starts"])
+    if not len(link) or link.min() < 0 or link.max() >= num_links or np.any(np.diff(link) < 0):
+        raise ValueError(f"its {name}/link is not of a robot with {num_links} links")
+    if not (np.all(found["radius"] > 0) and found["tau"] > 0):
+        raise ValueError(f"its {name}/radius or {name}/tau is not positive")
+    if starts[:1] != (0,) or any(type(n) is not int or not 0 <= n < len(link) for n in starts):
+        raise ValueError(f"its level {name} starts at {starts}")
+    told = [numbers[field] for field in ("size_px", "psnr_db", "match_bar")]
+    if not all(type(n) in (int, float) and 0 < n < 1e5 for n in told):
+        raise ValueError(f"its level {name} has {told} as size_px, psnr_db and match_bar")
+    return Level(
+        splats=SplatModel(**{k: jnp.asarray(v) for k, v in found.items()}, starts=starts),
+        size_px=numbers["size_px"],
+        psnr_db=numbers["psnr_db"],
+        match_threshold=numbers["match_bar"],
     )

@@ -1,5 +1,6 @@
 """A user's photograph of the goal: its camera file, lens and mask become an image goal's parts."""
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vrrt_jax.core.data_file import read_fields
+from vrrt_jax.core.data_file import of_file, read_fields
 from vrrt_jax.splat.camera_fields import camera_and_lens, with_extrinsics
 from vrrt_jax.splat.foreground import robot_before_background, robot_in_box
 from vrrt_jax.splat.images import MIN_OPAQUE
@@ -63,9 +64,12 @@ def load_photo(
     fields = camera if isinstance(camera, Mapping) else read_fields(camera)
     if extrinsics is not None:
         given = extrinsics if isinstance(extrinsics, Mapping) else read_fields(extrinsics)
-        fields = with_extrinsics(fields, given)
-    pinhole, lens = camera_and_lens(fields, pixels.shape[:2])
-    pixels = _with_mask(pixels, robot_mask, background, box)
+        with _of_source(extrinsics):
+            fields = with_extrinsics(fields, given)
+    with _of_source(camera):
+        pinhole, lens = camera_and_lens(fields, pixels.shape[:2])
+    with _of_source(image):
+        pixels = _with_mask(pixels, robot_mask, background, box)
     height, width = pixels.shape[:2]
     seen = np.ones((height, width), np.float32)
     if mask is not None:
@@ -75,6 +79,11 @@ def load_photo(
         pixels, seen = straight[..., :-1], known & (straight[..., -1] > KNOWN)
     seen = seen > 0
     return Photo(image=pixels, camera=pinhole, mask=None if seen.all() else seen)
+
+
+def _of_source(source: Any) -> contextlib.AbstractContextManager:
+    """What is wrong inside names the source, if that is a file."""
+    return of_file(source) if isinstance(source, str | Path) else contextlib.nullcontext()
 
 
 def _picture(image: Any, what: str) -> np.ndarray:
@@ -98,10 +107,12 @@ def _with_mask(pixels: np.ndarray, robot_mask: Any, background: Any, box: Any) -
     rgb = pixels[..., :3]
     height, width = rgb.shape[:2]
     if robot_mask is not None:
-        alpha = valid_mask(_picture_of_mask(robot_mask), height, width, "the robot's mask")
-        _check_not_inverted(alpha)
+        with _of_source(robot_mask):
+            alpha = valid_mask(_picture_of_mask(robot_mask), height, width, "the robot's mask")
+            _check_not_inverted(alpha)
     elif background is not None:
-        alpha = robot_before_background(rgb, _picture(background, "the background"))
+        with _of_source(background):
+            alpha = robot_before_background(rgb, _picture(background, "the background"))
     else:
         alpha = robot_in_box(rgb, box)
     return np.concatenate([rgb, alpha[..., None]], axis=-1)

@@ -5,8 +5,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from vrrt_jax.core.pictures import open_picture
 from vrrt_jax.splat.pixels import unit_pixels
 
+MOST_PIXELS = 1 << 26  # of a picture, as of one of 8192x8192
 STILL = ("JPEG", "MPO")  # formats whose further frames are only previews of the first
 EIGHT_BITS = (
     *("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "HSV"),
@@ -23,7 +25,12 @@ def read_image(path: str | Path) -> np.ndarray:
         ValueError: not a picture, or truncated, or animated, or of more than 16 bits.
     """
     try:
-        with Image.open(path) as picture:
+        with open_picture(path) as picture:
+            if picture.width * picture.height > MOST_PIXELS:
+                raise ValueError(
+                    f"'{path}' has {picture.width}x{picture.height} pixels; expected at most "
+                    f"{MOST_PIXELS}: make it smaller"
+                )
             frames = getattr(picture, "n_frames", 1)
             if frames > 1 and picture.format not in STILL:
                 raise ValueError(
@@ -31,14 +38,15 @@ def read_image(path: str | Path) -> np.ndarray:
                     "as a PNG"
                 )
             pixels = _decoded(ImageOps.exif_transpose(picture), path, picture.format == "PPM")
-    except FileNotFoundError:
-        raise FileNotFoundError(f"no picture at '{path}'; vrrt render makes goal images") from None
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"no picture: {error}; vrrt render makes goal images") from None
     except (
         UnidentifiedImageError,
         OSError,
         SyntaxError,
         EOFError,
         Image.DecompressionBombError,
+        OverflowError,
     ) as error:
         raise ValueError(f"'{path}' is not a readable picture: {error}") from None
     return unit_pixels(pixels, f"'{path}'")

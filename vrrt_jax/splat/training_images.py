@@ -5,12 +5,14 @@ MuJoCo renders the robot's true meshes. Poses are set kinematically, and cameras
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from tqdm import tqdm
 
+from vrrt_jax.core.arrays_file import read_arrays
 from vrrt_jax.core.files import replacing
 from vrrt_jax.robots.kinematics import body_links, link_poses
 from vrrt_jax.robots.robot import workspace
@@ -121,17 +123,13 @@ def write_images(file: Path, images: TrainingImages, points: np.ndarray) -> None
 
 def read_images(file: Path) -> tuple[TrainingImages, np.ndarray]:
     """Read what :func:`write_images` wrote."""
-    with np.load(file) as saved:
-        alpha = saved["coverage"]
-        cameras = Camera(
-            world_to_cam=jnp.asarray(saved["world_to_cam"]),
-            focal=jnp.asarray(saved["focal"]),
-            principal_point=jnp.asarray(saved["principal_point"]),
-            height=alpha.shape[1],
-            width=alpha.shape[2],
-        )
-        images = TrainingImages(q=saved["q"], cameras=cameras, rgb=saved["rgb"], alpha=alpha)
-        return images, saved["points"]
+    own = ("world_to_cam", "focal", "principal_point")
+    saved = read_arrays(file, "coverage", "q", "rgb", "points", *own)
+    alpha = saved["coverage"]
+    fields: dict[str, Any] = {name: jnp.asarray(saved[name]) for name in own}
+    cameras = Camera(**fields, height=alpha.shape[1], width=alpha.shape[2])
+    images = TrainingImages(q=saved["q"], cameras=cameras, rgb=saved["rgb"], alpha=alpha)
+    return images, saved["points"]
 
 
 def random_configurations(robot, num: int, rng: np.random.Generator) -> np.ndarray:

@@ -107,7 +107,10 @@ def test_a_run_that_was_cut_goes_on(measured, command, capsys):
         (["--homes", "home.npz", "--poses", "home.npz"], "pose 'occupied 0'"),
         (["--homes", "home.npz", "--poses", "short.json"], "has 1 poses; expected two at least"),
         (["--homes", "home.npz", "--poses", "text.json"], "holds no poses"),
-        (["--homes", "home.npz", "--task", "fetch"], "no maps for fetch in 'home.npz'"),
+        (
+            ["--homes", "home.npz", "--task", "fetch"],
+            "'home.npz': this robot needs a map with heights",
+        ),
     ],
 )
 def test_bad_options_are_told_in_one_line(options, words, folder, monkeypatch, capsys):

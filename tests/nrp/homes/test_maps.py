@@ -1,13 +1,16 @@
 """Maps and their files: cells, ROS's map_server, MJCF scenes, and what is refused."""
 
+import warnings
+
 import mujoco
 import numpy as np
 import pytest
 from PIL import Image
 
 import nrp_jax
-from nrp_jax.homes import memory, mjcf_map
+from nrp_jax.homes import mjcf_map
 from nrp_jax.homes.grid import coarsened, load_map
+from vrrt_jax.core import memory
 
 ROS = "image: home.png\nresolution: 0.1\norigin: [-1.0, -2.0, 0.0]\n"
 
@@ -86,7 +89,7 @@ def test_bad_map_files(tmp_path):
     with pytest.raises(ValueError, match="unknown kind"):
         load_map(tmp_path / "map.txt")
     (tmp_path / "map.npz").write_text("not a zip")
-    with pytest.raises(ValueError, match="not a readable .npz"):
+    with pytest.raises(ValueError, match="no readable .npz"):
         load_map(tmp_path / "map.npz")
     with pytest.raises(ValueError, match="cells are 0.3 m"):
         coarsened(nrp_jax.Grid(occupied=np.zeros((3, 3)), resolution=0.3))
@@ -377,3 +380,11 @@ def test_malformed_npz_maps(tmp_path, arrays, message):
     np.savez(tmp_path / "map.npz", **{"occupied": np.zeros((4, 4), bool), **arrays})
     with pytest.raises(ValueError, match=message):
         load_map(tmp_path / "map.npz")
+
+
+def test_a_crop_beyond_the_map_is_told(tmp_path):
+    nrp_jax.Grid(occupied=np.eye(30, dtype=bool)).save(tmp_path / "map.npz")
+    with pytest.warns(UserWarning, match=r"reaches beyond the map; .* spans .* to \[3.0, 2.0\] m"):
+        assert load_map(tmp_path / "map.npz", crop=(1, 1, 5, 2)).occupied.shape == (20, 10, 1)
+    with warnings.catch_warnings(action="error"):
+        load_map(tmp_path / "map.npz", crop=(0, 0, 3, 3))

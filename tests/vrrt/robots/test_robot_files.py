@@ -148,7 +148,7 @@ def test_what_is_no_urdf_yet_is_refused(tmp_path):
             load_robot(write(tmp_path, text, "a.urdf.xacro"))
 
 
-@pytest.mark.parametrize("limits", ["1 -1", "1 1", "0 0", "nan 1", "-inf inf", "-1 1e9"])
+@pytest.mark.parametrize("limits", ["1 -1", "1 1", "0 0", "-inf inf", "-1 1e9"])
 def test_unclear_ranges_of_mjcf_are_refused_by_name(tmp_path, limits):
     path = write(tmp_path, HINGE.replace("LIMITS", f'range="{limits}"'))
     with pytest.raises(ValueError, match=r"joint 'lift' has .*freeze={'lift'"):

@@ -57,7 +57,7 @@ def test_a_folder_is_a_robot_with_a_self_model(folder, tmp_path):
 
 def test_a_record_comes_back(folder):
     record = robot_folder.read_record(folder)
-    again = dataclasses.replace(record, rounds=2, levels=[{"size_px": 32}])
+    again = dataclasses.replace(record, rounds=2, levels=({"size_px": 32},))
     robot_folder.write_record(folder, again)
     assert robot_folder.read_record(folder) == again
     assert robot_folder.model_file(folder) == folder / MODEL
@@ -77,8 +77,8 @@ def test_it_is_a_robot_without_the_file_that_it_was_made_of(folder, tmp_path):
         (lambda folder: edit(folder, format=2), "has format 2, expected 1"),
         (lambda folder: edit(folder, color="red"), "unknown fields: color"),
         (lambda folder: edit(folder, rounds=None), "lacks the field rounds"),
-        (lambda folder: edit(folder, rounds="1"), "rounds is '1'; expected a whole number"),
-        (lambda folder: edit(folder, made_of=[]), "does not say what the robot was made of"),
+        (lambda folder: edit(folder, rounds="1"), "has rounds '1'; expected a whole number"),
+        (lambda folder: edit(folder, made_of={}), "does not say what the robot was made of"),
         (lambda folder: edit(folder, rounds=0), "no self-model yet: .* go on with: vrrt fit .*arm"),
         (lambda folder: (folder / MODEL).unlink(), "has no robot.xml"),
         (lambda folder: (folder / SELF_MODEL).unlink(), "has no self_model.npz"),

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import vrrt_jax
 from vrrt_jax.robots import load_robot, mesh_sources, packaged
 from vrrt_jax.robots.kinematics import body_links, lever_arms, link_poses, place, placement
 
@@ -441,3 +442,11 @@ def test_lever_arms_bound_how_far_spheres_move(name, rng):
     assert np.all(most <= arms + 1e-5)
     # The bound is not much longer than what some configuration reaches.
     assert np.median(arms[arms > 0.05] / most[arms > 0.05]) < 1.3
+
+
+def test_poses_of_links_are_asked_of_a_robot_too(panda):
+    expected = link_poses(panda.chain, jnp.asarray(panda.home, jnp.float32))
+    for whose in (panda, vrrt_jax.build_world(panda, [], engine="closed_form")):
+        np.testing.assert_allclose(link_poses(whose, panda.home.tolist()), expected, atol=1e-6)
+    with pytest.raises(ValueError, match=r"q has shape \(2, 7\); expected \(7,\)"):
+        link_poses(panda, np.zeros((2, 7)))

@@ -222,3 +222,12 @@ def test_the_cameras_of_the_documents_are_one_camera(tmp_path):
         camera, lens = camera_and_lens(with_extrinsics(fields, pose), SIZE)
         np.testing.assert_allclose(camera.world_to_cam, expected.world_to_cam, atol=1e-4)
         np.testing.assert_allclose(lens.coefficients, [-0.32, 0.12, 0.0006, -0.0004, -0.015])
+
+
+@pytest.mark.parametrize("times", [2, 3, 4])
+def test_the_matrix_of_a_smaller_image_is_refused(times):
+    """Its principal point is in the middle of that image."""
+    matrix = np.array(OPENCV["camera_matrix"], float)
+    matrix[:2] /= times
+    with pytest.raises(ValueError, match=f"in the middle of an image of 1/{times} of"):
+        camera_and_lens(OPENCV | {"camera_matrix": matrix.tolist()}, (480, 640))

@@ -106,7 +106,7 @@ def test_options_of_the_command_are_told_in_one_line(shot, tmp_path, capsys):
         ([*pose, "--box", "1,2,3"], "'1,2,3' is not a box"),
         ([*pose, "--box", "1,2,900,40"], "is not inside the image of 320x240 px"),
         ([*pose, "--box=-1,2,90,40"], "is not inside the image of 320x240 px"),
-        ([*pose, "--background", tmp_path / "none.png"], "no picture at"),
+        ([*pose, "--background", tmp_path / "none.png"], "no picture: cannot read"),
         ([*pose, "--background", tmp_path / "goal.png"], "hardly differs"),
         (
             [*pose, "--robot-mask", *[tmp_path / "empty.png"] * 2],

@@ -126,3 +126,9 @@ def test_what_cannot_be_read_rightly_is_refused(tmp_path, picture):
     file.write_bytes(b"")
     with pytest.raises(ValueError, match="not a readable picture"):
         vrrt_jax.read_image(file)
+
+
+def test_pictures_that_would_fill_the_memory_are_not_read(tmp_path):
+    Image.new("1", (9000, 8000)).save(tmp_path / "large.png")
+    with pytest.raises(ValueError, match="large.png' has 9000x8000 pixels; expected at most"):
+        vrrt_jax.read_image(tmp_path / "large.png")
