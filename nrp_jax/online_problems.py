@@ -58,7 +58,8 @@ class Problems:
         num_states = self.dataset.settings.waypoints + 2
         if file.exists():
             arrays: dict[str, Any] = read_arrays(file, "home", "q", "length", "tried")
-            return FoundPaths(**arrays | {"tried": int(arrays["tried"])})
+            arrays["tried"] = int(arrays["tried"])
+            return FoundPaths(**arrays)
         homes, paths, lengths, problem = [], [], [], first
         while problem < settings.problems and len(paths) * (num_states - 1) < settings.states:
             home, world, path = self._solved(problem, model)
