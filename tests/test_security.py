@@ -10,7 +10,8 @@ FILES = [*ROOT.glob("vrrt_jax/**/*.py"), *ROOT.glob("nrp_jax/**/*.py")]
 # Modules that unpickle, or talk to others; who may use one, as it needs no network.
 NEVER = {"pickle", "dill", "joblib", "cloudpickle", "shelve", "marshal", "requests", "urllib3"}
 RARELY = {
-    "socket": {"vrrt_jax/scene/page.py"},  # looks for a free port of 127.0.0.1
+    # A free port of 127.0.0.1; whether a cluster that was named is there.
+    "socket": {"vrrt_jax/scene/page.py", "vrrt_jax/core/cluster.py"},
     "urllib": {"vrrt_jax/robots/urdf.py"},  # unquotes the names of meshes
     "http": set(),
 }
