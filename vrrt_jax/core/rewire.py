@@ -14,10 +14,12 @@ import jax.numpy as jnp
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edge_checks import is_edge_free
 from vrrt_jax.core.edges import Space, distance
+from vrrt_jax.core.shortcut import best_splice
 from vrrt_jax.core.types import Expansion, Tree
 
 Payload = TypeVar("Payload")
 GAIN = 1e-4  # [rad] adoptions that save less are rounding noise
+BRANCH = 64  # nodes of a path, from its end on, between which shortcuts are drawn
 
 
 def rewire(
@@ -101,6 +103,55 @@ def rewire(
     checked = tree.checked + checked_parents + checked_children
     tree = dataclasses.replace(tree, parent=parent, cost=cost, checked=checked)
     return jax.lax.cond(jnp.any(wins), lambda t: with_costs(world, t), lambda t: t, tree)
+
+
+def shortcut_branch(
+    world: Space, tree: Tree[None], threshold: jax.Array, key: jax.Array
+) -> Tree[None]:
+    """Replace a detour of the best path by a straight edge, if one of those drawn is free.
+
+    The ends of the edge become nodes without a score, and what comes after the detour hangs on the
+    second of them. So the tree keeps what shortcuts gain, and the informed set shrinks by it.
+
+    Args:
+        world: robot and obstacles.
+        tree: the tree.
+        threshold: () score that the end of a path has at most.
+        key: random key.
+    """
+
+    def up(node: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
+        return jnp.where(node >= 0, tree.parent[node], -1), node
+
+    def shorter(tree: Tree[None]) -> Tree[None]:
+        # The last nodes of the path, from the root's side on, and the best straight edge.
+        end = trees.best_node(tree, threshold)
+        chain = jax.lax.scan(up, end, length=BRANCH)[1]
+        size = jnp.sum(chain >= 0)
+        nodes = chain[jnp.maximum(size - 1 - jnp.arange(BRANCH), 0)]
+        # What shortens a path touches what it goes around, so that it is checked twice as finely.
+        finer = dataclasses.replace(world, resolution=world.resolution / 2)
+        splice = best_splice(finer, tree.q[nodes], size, key)
+
+        # Its ends are a child of the node before the detour, and a child of that.
+        found = splice.found & (tree.size + 2 <= tree.capacity)
+        unknown = jnp.full(2, jnp.inf, tree.score.dtype)
+        tree, new = trees.insert(
+            tree,
+            q=jnp.stack([splice.q_from, splice.q_to]),
+            parent=jnp.stack([nodes[splice.first], tree.size]),
+            cost=unknown,
+            score=unknown,
+            payload=None,
+            valid=jnp.broadcast_to(found, 2),
+        )
+        after = jnp.where(found, nodes[splice.last + 1], tree.capacity)
+        parent = tree.parent.at[after].set(new[1], mode="drop")
+        tree = dataclasses.replace(tree, parent=parent, checked=tree.checked + splice.checked)
+        return jax.lax.cond(found, lambda t: with_costs(world, t), lambda t: t, tree)
+
+    is_path = jnp.isfinite(trees.path_cost(tree, threshold))
+    return jax.lax.cond(is_path, shorter, lambda t: t, tree)
 
 
 def winners(node: jax.Array, gain: jax.Array, capacity: int) -> jax.Array:
