@@ -14,12 +14,13 @@ import jax.numpy as jnp
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edge_checks import is_edge_free
 from vrrt_jax.core.edges import Space, distance
-from vrrt_jax.core.shortcut import best_splice
+from vrrt_jax.core.shortcut import EDGE_STEPS, best_splice
 from vrrt_jax.core.types import Expansion, Tree
 
 Payload = TypeVar("Payload")
 GAIN = 1e-4  # [rad] adoptions that save less are rounding noise
 BRANCH = 64  # nodes of a path, from its end on, between which shortcuts are drawn
+FINER = 8  # times that checks of shortcuts are finer than those of other edges
 
 
 def rewire(
@@ -129,12 +130,17 @@ def shortcut_branch(
         chain = jax.lax.scan(up, end, length=BRANCH)[1]
         size = jnp.sum(chain >= 0)
         nodes = chain[jnp.maximum(size - 1 - jnp.arange(BRANCH), 0)]
-        # What shortens a path touches what it goes around, so that it is checked twice as finely.
-        finer = dataclasses.replace(world, resolution=world.resolution / 2)
-        splice = best_splice(finer, tree.q[nodes], size, key)
+        splice = best_splice(world, tree.q[nodes], size, key)
+
+        # What shortens a path all but touches what it goes around: it is checked far more finely.
+        finer = dataclasses.replace(world, resolution=world.resolution / FINER)
+        edge = world.edge(splice.q_from[None], splice.q_to[None])
+        free, checked = is_edge_free(
+            finer, splice.q_from[None], edge, FINER * EDGE_STEPS, splice.found
+        )
 
         # Its ends are a child of the node before the detour, and a child of that.
-        found = splice.found & (tree.size + 2 <= tree.capacity)
+        found = free[0] & (tree.size + 2 <= tree.capacity)
         unknown = jnp.full(2, jnp.inf, tree.score.dtype)
         tree, new = trees.insert(
             tree,
@@ -147,7 +153,8 @@ def shortcut_branch(
         )
         after = jnp.where(found, nodes[splice.last + 1], tree.capacity)
         parent = tree.parent.at[after].set(new[1], mode="drop")
-        tree = dataclasses.replace(tree, parent=parent, checked=tree.checked + splice.checked)
+        checked += tree.checked + splice.checked
+        tree = dataclasses.replace(tree, parent=parent, checked=checked)
         return jax.lax.cond(found, lambda t: with_costs(world, t), lambda t: t, tree)
 
     is_path = jnp.isfinite(trees.path_cost(tree, threshold))
