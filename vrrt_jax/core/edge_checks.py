@@ -84,7 +84,8 @@ def first_free_edge(
 ) -> tuple[jax.Array, jax.Array]:
     """The first of B edges along which nothing is touched, () i32; B if there is none.
 
-    Also () i32 how many configurations were checked. Edges after one that is known to be free cost nothing more. See :func:`free_prefix`.
+    Edges after one that is known to be free cost nothing more. Also returned is () i32 how many
+    configurations were checked. See :func:`free_prefix`.
 
     Args:
         world: what to collide with.
