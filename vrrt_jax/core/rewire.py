@@ -6,7 +6,7 @@ forest this also joins trees: their roots, but for the first, may be adopted lik
 """
 
 import dataclasses
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -133,7 +133,8 @@ def shortcut_branch(
         splice = best_splice(world, tree.q[nodes], size, key)
 
         # What shortens a path all but touches what it goes around: it is checked far more finely.
-        finer = dataclasses.replace(world, resolution=world.resolution / FINER)
+        finer: Any = world  # a dataclass, which the protocol does not tell
+        finer = dataclasses.replace(finer, resolution=world.resolution / FINER)
         edge = world.edge(splice.q_from[None], splice.q_to[None])
         free, checked = is_edge_free(
             finer, splice.q_from[None], edge, FINER * EDGE_STEPS, splice.found
