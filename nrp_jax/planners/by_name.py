@@ -41,15 +41,17 @@ KINDS = {
     "nrp-star-g": "cvae",
     **dict.fromkeys(CONNECT, "cvae"),
 }
-# How trees are rewired.
+# How trees are rewired: by edges as long as those that they grow by.
 REWIRING = {
     "rewire_radius": np.float32(np.inf),
-    "rewire_steps": 32,
-    "neighbors": 8,
+    "rewire_steps": EDGE_STEPS,
+    "neighbors": 24,  # by the formula of k-RRT* in eight dimensions, of 2,600 nodes
     "tries": 4,
     "ancestors": 4,
+    "shortcuts": 1,
 }
-NEXT_REWIRING = {**REWIRING, "rewire_radius": np.float32(2.0)}  # as published
+# As published. Its nodes have what the guide says of them, which shortcuts would have to ask for.
+NEXT_REWIRING = {**REWIRING, "rewire_radius": np.float32(2.0), "shortcuts": 0}
 
 
 def planners_of(task: str) -> tuple[str, ...]:

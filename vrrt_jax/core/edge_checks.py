@@ -81,10 +81,11 @@ def is_edge_free(
 
 def first_free_edge(
     world: Space, q_from: jax.Array, edge: Edge, num_steps: int, tried: jax.Array
-) -> jax.Array:
+) -> tuple[jax.Array, jax.Array]:
     """The first of B edges along which nothing is touched, () i32; B if there is none.
 
-    Edges after one that is known to be free cost nothing more. See :func:`free_prefix`.
+    Edges after one that is known to be free cost nothing more. Also returned is () i32 how many
+    configurations were checked. See :func:`free_prefix`.
 
     Args:
         world: what to collide with.
@@ -105,7 +106,7 @@ def first_free_edge(
 
     few = FEW_CHECKS
     checks = _check(world, q_from, edge, num_steps, matters, ends_known=True, batch=few)
-    return first_free(checks)
+    return first_free(checks), checks.checked
 
 
 @pytree

@@ -12,6 +12,7 @@ from vrrt_jax.core.edges import Space
 from vrrt_jax.core.types import Expansion, ExpansionPolicy, Payload, Rejection, Tree
 
 SHORTEST_EDGE = 1e-5  # [rad] a shorter step would only duplicate its parent
+AFTER = 1 << 30  # folded into an iteration's key for what comes after it
 
 
 def expand(
@@ -28,7 +29,8 @@ def expand(
             on how iterations are grouped into chunks.
     """
     # Propose: a parent and a target for every lane. Lanes without either stand in at node 0.
-    proposals = policy.propose(world, goal, tree, jax.random.fold_in(key, tree.iteration))
+    key = jax.random.fold_in(key, tree.iteration)
+    proposals = policy.propose(world, goal, tree, key)
     parent = jnp.where(proposals.valid, proposals.parent, 0)
     q_from = tree.q[parent]
 
@@ -83,7 +85,9 @@ def expand(
     expansion = Expansion(
         q=q, node_index=node_index, accepted=accepted, blocked=num_free < policy.edge_steps
     )
-    return policy.after_insert(world, goal, tree, proposals, expansion)
+    tree = policy.after_insert(world, goal, tree, proposals, expansion)
+    after = getattr(policy, "after_iteration", None)
+    return after(world, goal, tree, jax.random.fold_in(key, AFTER)) if after else tree
 
 
 def _count_reasons(*reasons: jax.Array) -> jax.Array:

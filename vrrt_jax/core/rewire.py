@@ -6,7 +6,7 @@ forest this also joins trees: their roots, but for the first, may be adopted lik
 """
 
 import dataclasses
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +14,13 @@ import jax.numpy as jnp
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edge_checks import is_edge_free
 from vrrt_jax.core.edges import Space, distance
+from vrrt_jax.core.shortcut import EDGE_STEPS, best_splice
 from vrrt_jax.core.types import Expansion, Tree
 
 Payload = TypeVar("Payload")
 GAIN = 1e-4  # [rad] adoptions that save less are rounding noise
+BRANCH = 64  # nodes of a path, from its end on, between which shortcuts are drawn
+FINER = 8  # times that checks of shortcuts are finer than those of other edges
 
 
 def rewire(
@@ -101,6 +104,62 @@ def rewire(
     checked = tree.checked + checked_parents + checked_children
     tree = dataclasses.replace(tree, parent=parent, cost=cost, checked=checked)
     return jax.lax.cond(jnp.any(wins), lambda t: with_costs(world, t), lambda t: t, tree)
+
+
+def shortcut_branch(
+    world: Space, tree: Tree[None], threshold: jax.Array, key: jax.Array
+) -> Tree[None]:
+    """Replace a detour of the best path by a straight edge, if one of those drawn is free.
+
+    The ends of the edge become nodes without a score, and what comes after the detour hangs on the
+    second of them. So the tree keeps what shortcuts gain, and the informed set shrinks by it.
+
+    Args:
+        world: robot and obstacles.
+        tree: the tree.
+        threshold: () score that the end of a path has at most.
+        key: random key.
+    """
+
+    def up(node: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
+        return jnp.where(node >= 0, tree.parent[node], -1), node
+
+    def shorter(tree: Tree[None]) -> Tree[None]:
+        # The last nodes of the path, from the root's side on, and the best straight edge.
+        end = trees.best_node(tree, threshold)
+        chain = jax.lax.scan(up, end, length=BRANCH)[1]
+        size = jnp.sum(chain >= 0)
+        nodes = chain[jnp.maximum(size - 1 - jnp.arange(BRANCH), 0)]
+        splice = best_splice(world, tree.q[nodes], size, key)
+
+        # What shortens a path all but touches what it goes around: it is checked far more finely.
+        finer: Any = world  # a dataclass, which the protocol does not tell
+        finer = dataclasses.replace(finer, resolution=world.resolution / FINER)
+        edge = world.edge(splice.q_from[None], splice.q_to[None])
+        free, checked = is_edge_free(
+            finer, splice.q_from[None], edge, FINER * EDGE_STEPS, splice.found
+        )
+
+        # Its ends are a child of the node before the detour, and a child of that.
+        found = free[0] & (tree.size + 2 <= tree.capacity)
+        unknown = jnp.full(2, jnp.inf, tree.score.dtype)
+        tree, new = trees.insert(
+            tree,
+            q=jnp.stack([splice.q_from, splice.q_to]),
+            parent=jnp.stack([nodes[splice.first], tree.size]),
+            cost=unknown,
+            score=unknown,
+            payload=None,
+            valid=jnp.broadcast_to(found, 2),
+        )
+        after = jnp.where(found, nodes[splice.last + 1], tree.capacity)
+        parent = tree.parent.at[after].set(new[1], mode="drop")
+        checked += tree.checked + splice.checked
+        tree = dataclasses.replace(tree, parent=parent, checked=checked)
+        return jax.lax.cond(found, lambda t: with_costs(world, t), lambda t: t, tree)
+
+    is_path = jnp.isfinite(trees.path_cost(tree, threshold))
+    return jax.lax.cond(is_path, shorter, lambda t: t, tree)
 
 
 def winners(node: jax.Array, gain: jax.Array, capacity: int) -> jax.Array:

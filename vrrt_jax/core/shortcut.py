@@ -37,7 +37,7 @@ def shortcut(
 ) -> np.ndarray:
     """Shorten a collision-free path; the ends stay.
 
-    In every round 32 pairs of places on the path are drawn, and of the straight edges between them
+    In every round 16 pairs of places on the path are drawn, and of the straight edges between them
     the free one that saves most is taken.
 
     Args:
@@ -67,10 +67,31 @@ def _shortcut(world: Space, q, size, key, rounds, patience) -> _Path:
     )
 
 
-def _round(world: Space, path: _Path, key: jax.Array) -> _Path:
-    """Try 32 candidates, splice in the free one that saves most."""
+@pytree
+class Splice:
+    """A straight edge between two places on a path, and where it belongs."""
+
+    found: jax.Array  # () bool, there is one that is free and saves something
+    first: jax.Array  # () i32 the waypoint before its beginning
+    last: jax.Array  # () i32 the waypoint before its end
+    q_from: jax.Array  # (D,)
+    q_to: jax.Array  # (D,)
+    saving: jax.Array  # () how much shorter the path gets
+    length: jax.Array  # () of the path before
+    checked: jax.Array  # () i32 configurations checked
+
+
+def best_splice(world: Space, q: jax.Array, size: jax.Array, key: jax.Array) -> Splice:
+    """Of the straight edges between 16 pairs of places on a path the free one that saves most.
+
+    Args:
+        world: robot and obstacles.
+        q: (P, D) waypoints, the last one repeated beyond ``size``.
+        size: () i32 how many there are.
+        key: random key.
+    """
     # Lengths along the path; zero beyond its end.
-    edges = world.edge(path.q[:-1], path.q[1:])
+    edges = world.edge(q[:-1], q[1:])
     length = world.length(edges)
     along = jnp.concatenate([jnp.zeros(1), jnp.cumsum(length)])
 
@@ -78,33 +99,48 @@ def _round(world: Space, path: _Path, key: jax.Array) -> _Path:
     # along it, and the configurations there.
     ends = along[-1] * jax.random.uniform(key, (LANES, 2))
     ends = jnp.sort(ends.at[0].set(jnp.stack([0.0 * along[-1], along[-1]])), axis=1)
-    index = jnp.clip(jnp.searchsorted(along, ends, side="right") - 1, 0, path.size - 2)
+    index = jnp.clip(jnp.searchsorted(along, ends, side="right") - 1, 0, size - 2)
     share = jnp.clip((ends - along[index]) / jnp.maximum(length[index], 1e-9), 0.0, 1.0)
     parts = world.truncate(_rows(edges, index), share)
-    q_ends, at = world.end(path.q[index], parts), along[index] + world.length(parts)
+    q_ends, at = world.end(q[index], parts), along[index] + world.length(parts)
     q_a, q_b = q_ends[:, 0], q_ends[:, 1]
 
     # Straight edges between them, those that save most first. The first free one is taken.
     direct = world.edge(q_a, q_b)
     saving = at[:, 1] - at[:, 0] - world.length(direct)
-    size = index[:, 0] + 3 + path.size - (index[:, 1] + 1)
-    tried = (saving > GAIN) & world.is_resolved(direct, EDGE_STEPS) & (size <= path.q.shape[0])
+    room = index[:, 0] + 3 + size - (index[:, 1] + 1) <= q.shape[0]
+    tried = (saving > GAIN) & world.is_resolved(direct, EDGE_STEPS) & room
     saving, lane = jax.lax.top_k(jnp.where(tried, saving, 0.0), CHECKED)
-    row = first_free_edge(world, q_a[lane], _rows(direct, lane), EDGE_STEPS, saving > 0)
-    found = row < CHECKED
-    best = lane[jnp.minimum(row, CHECKED - 1)]
+    asked = q_a[lane], _rows(direct, lane), EDGE_STEPS, saving > 0
+    row, checked = first_free_edge(world, *asked)
+    row, found = jnp.minimum(row, CHECKED - 1), row < CHECKED
+    best = lane[row]
+    return Splice(
+        found=found,
+        first=index[best, 0],
+        last=index[best, 1],
+        q_from=world.normalize(q_a[best]),
+        q_to=world.normalize(q_b[best]),
+        saving=saving[row],
+        length=along[-1],
+        checked=checked,
+    )
 
-    # Splice it in: its two ends become waypoints between the edges that they lie on.
-    first, last, size = index[best, 0], index[best, 1], size[best]
+
+def _round(world: Space, path: _Path, key: jax.Array) -> _Path:
+    """Try 16 candidates, splice in the free one that saves most."""
+    splice = best_splice(world, path.q, path.size, key)
+    # Its two ends become waypoints between the edges that they lie on.
+    first, last = splice.first, splice.last
     place = jnp.arange(path.q.shape[0])
     source = jnp.where(place <= first, place, place - (first + 3) + last + 1)
     spliced = path.q[jnp.clip(source, 0, path.q.shape[0] - 1)]
-    spliced = jnp.where((place == first + 1)[:, None], world.normalize(q_a[best]), spliced)
-    spliced = jnp.where((place == first + 2)[:, None], world.normalize(q_b[best]), spliced)
-    pays = found & (saving[jnp.minimum(row, CHECKED - 1)] > PAYS * along[-1])
+    spliced = jnp.where((place == first + 1)[:, None], splice.q_from, spliced)
+    spliced = jnp.where((place == first + 2)[:, None], splice.q_to, spliced)
+    pays = splice.found & (splice.saving > PAYS * splice.length)
     return _Path(
-        q=jnp.where(found, spliced, path.q),
-        size=jnp.where(found, size, path.size),
+        q=jnp.where(splice.found, spliced, path.q),
+        size=jnp.where(splice.found, first + 3 + path.size - (last + 1), path.size),
         idle=jnp.where(pays, 0, path.idle + 1),
         round=path.round + 1,
     )
@@ -145,7 +181,7 @@ def _kept(world: Space, q: jax.Array, size: jax.Array) -> jax.Array:
         tried = (farthest_first > at + 1) & (farthest_first < size)
         tried &= world.is_resolved(edge, EDGE_STEPS)
         tried &= world.length(edge) <= along[farthest_first] - along[at]
-        row = first_free_edge(world, q_from, edge, EDGE_STEPS, tried)
+        row, _ = first_free_edge(world, q_from, edge, EDGE_STEPS, tried)
         at = jnp.where(row < room, farthest_first[jnp.minimum(row, room - 1)], at + 1)
         return at, kept.at[at].set(True)
 

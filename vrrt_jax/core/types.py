@@ -224,7 +224,8 @@ class ExpansionPolicy(Protocol[Payload]):
 
     A policy may also say how long its best path is so far, for the history of a search:
     ``path_cost(tree, threshold)`` is a length (), inf before the first path, where ``threshold`` ()
-    is the goal's. Without it that is :func:`vrrt_jax.core.tree.path_cost`.
+    is the goal's. Without it that is :func:`vrrt_jax.core.tree.path_cost`. If it has
+    ``after_iteration(world, goal, tree, key)``, the kernel goes on with the tree that this returns.
     """
 
     @property

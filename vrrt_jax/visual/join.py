@@ -84,7 +84,7 @@ def cheapest_parent(
     q_from = tree.q[node]
     edge = world.edge(q_from, jnp.broadcast_to(q_goal, q_from.shape))
     tried = (rank > -jnp.inf) & world.is_resolved(edge, num_steps)
-    first = first_free_edge(world, q_from, edge, num_steps, tried)
+    first, _ = first_free_edge(world, q_from, edge, num_steps, tried)
     return node[jnp.minimum(first, len(node) - 1)], first < len(node)
 
 

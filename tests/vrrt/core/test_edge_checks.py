@@ -51,7 +51,7 @@ def test_few_checks_find_what_all_find(wall_world, free, rng, kind, num_steps, l
         return (
             free_prefix(world, start, edge, num_steps),
             is_edge_free(world, start, edge, num_steps),
-            first_free_edge(world, start, edge, num_steps, tried),
+            first_free_edge(world, start, edge, num_steps, tried)[0],
         )
 
     ends_free = is_free[:, -1]

@@ -5,11 +5,12 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from core_cases import START
+from core_cases import START, assert_free
 
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.informed import sample_informed
-from vrrt_jax.core.rewire import rewire, winners
+from vrrt_jax.core.planners import RRT, RRTConnect
+from vrrt_jax.core.rewire import rewire, shortcut_branch, winners
 from vrrt_jax.core.types import Expansion
 
 
@@ -55,6 +56,35 @@ def test_a_rewired_tree_has_no_cycles_and_right_costs(wall_world, rng):
     np.testing.assert_allclose(after, plain_costs(done), atol=1e-4)
     assert np.all(after <= before + 1e-4) and np.sum(after < before - 0.1) > new
     assert int(done.parent[0]) == -1 and int(done.checked) > 0
+
+
+def test_shortcuts_of_the_best_path_stay_in_the_tree(wall_world, free, connected):
+    """One after the other: the goal's cost falls, costs stay right, and other branches stay."""
+    path = RRTConnect().extract_path(connected.tree)
+    size, aside = len(path) + 1, path[1] + np.float32(0.01)
+    tree = trees.create(path[:1], jnp.zeros(1), None, 64)
+    tree = dataclasses.replace(
+        tree,
+        q=tree.q.at[:size].set(np.concatenate([path, aside[None]])),
+        parent=tree.parent.at[:size].set(np.r_[-1, np.arange(size - 2), 1]),
+        score=tree.score.at[:size].set(1.0).at[size - 2].set(0.0),
+        size=jnp.int32(size),
+    )
+    tree = dataclasses.replace(tree, cost=tree.cost.at[:size].set(plain_costs(tree)))
+    turn = jax.jit(lambda world, tree, key: shortcut_branch(world, tree, 0.1, key))
+    costs = [float(tree.cost[size - 2])]
+    for number in range(16):
+        tree = turn(wall_world, tree, jax.random.key(number))
+        costs.append(float(tree.cost[size - 2]))
+    assert np.all(np.diff(costs) <= 1e-5) and costs[-1] < 0.9 * costs[0]
+    np.testing.assert_allclose(tree.cost[: int(tree.size)], plain_costs(tree), atol=1e-4)
+    short = RRT().extract_path(tree)
+    np.testing.assert_array_equal(short[[0, -1]], path[[0, -1]])
+    assert_free(wall_world, free, short)
+    assert int(tree.parent[size - 1]) == 1 and int(tree.checked) > 0
+    # Without a path, and without room, nothing is done.
+    none = dataclasses.replace(tree, score=jnp.ones(64))
+    assert int(turn(wall_world, none, jax.random.key(0)).checked) == int(tree.checked)
 
 
 def test_the_best_of_several_offers_is_taken():

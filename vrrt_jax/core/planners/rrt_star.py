@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar, Self
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -9,7 +10,7 @@ from vrrt_jax.core.edge_checks import num_checks
 from vrrt_jax.core.edges import Space
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners.rrt import RRT
-from vrrt_jax.core.rewire import rewire
+from vrrt_jax.core.rewire import rewire, shortcut_branch
 from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
 
 
@@ -27,6 +28,7 @@ class RRTStar(RRT):
     neighbors: int | None = static(default=None)
     tries: int = static(default=1)
     ancestors: int = static(default=0)
+    shortcuts: int = static(default=0)  # rounds of shortcuts of the best path in an iteration
 
     @classmethod
     def for_world(cls, world: Space, **settings: Any) -> Self:
@@ -70,3 +72,12 @@ class RRTStar(RRT):
             tries=self.tries,
             ancestors=self.ancestors,
         )
+
+    def after_iteration(
+        self, world: Space, goal: ConfigurationGoal, tree: Tree, key: jax.Array
+    ) -> Tree:
+        """Shorten the best path."""
+        for turn in range(self.shortcuts):
+            again = jax.random.fold_in(key, turn)
+            tree = shortcut_branch(world, tree, goal.threshold, again)
+        return tree
