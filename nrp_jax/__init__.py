@@ -1,6 +1,6 @@
 """Neural randomized planning in JAX: learned samplers for long-horizon motion in homes."""
 
-import vrrt_jax as _kernel  # noqa: F401 - first, as it says what Ctrl-C does meanwhile
+import vrrt_jax.core as _kernel  # noqa: F401 - first: it says what Ctrl-C does meanwhile
 from nrp_jax.batch import plan_batch
 from nrp_jax.config import PlannerConfig
 from nrp_jax.homes.grid import Grid, load_map

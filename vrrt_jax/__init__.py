@@ -8,6 +8,7 @@ from vrrt_jax.gl import choose_backend as _choose_backend
 _end_at_once_while_starting()  # what follows takes seconds
 _choose_backend()  # before anything imports MuJoCo
 
+from vrrt_jax.batch import plan_batch  # noqa: E402
 from vrrt_jax.config import (  # noqa: E402
     Budget,
     ExpandConfig,
@@ -35,7 +36,7 @@ from vrrt_jax.motion.export import save_trajectory  # noqa: E402
 from vrrt_jax.motion.limits import MotionLimits, motion_limits  # noqa: E402
 from vrrt_jax.motion.simulate import Tracking, execute_in_sim  # noqa: E402
 from vrrt_jax.motion.trajectory import Trajectory, time_parameterize  # noqa: E402
-from vrrt_jax.planner import plan, plan_batch, plan_to_configuration, plan_waypoints  # noqa: E402
+from vrrt_jax.planner import plan, plan_to_configuration, plan_waypoints  # noqa: E402
 from vrrt_jax.pose import inverse_kinematics, plan_to_pose  # noqa: E402
 from vrrt_jax.problems import Problem, load_problem, load_world, problem_names  # noqa: E402
 from vrrt_jax.robots import Robot, load_robot, robot_names  # noqa: E402

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax import checks
-from vrrt_jax.attempts import plan_batch_by_loss, plan_by_loss
+from vrrt_jax.attempts import plan_by_loss
 from vrrt_jax.config import PlannerConfig, check_config
 from vrrt_jax.core.check_protocols import check_goal, check_policy
 from vrrt_jax.core.goal import ConfigurationGoal
@@ -17,7 +17,7 @@ from vrrt_jax.core.planners import PLANNERS, RRT, RRTConnect, RRTStar
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import PlanResult
 from vrrt_jax.core.types import ExpansionPolicy, Goal
-from vrrt_jax.joint import plan_each_to_configuration, plan_to_goal
+from vrrt_jax.joint import plan_to_goal
 from vrrt_jax.outcome import Progress
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.world import World
@@ -110,12 +110,12 @@ def plan(
         goal, inputs = _image_goal(goal, inputs, mask)
     elif mask is not None:
         raise ValueError("mask is given beside a goal; expected ImageGoal(..., mask=mask)")
-    (start,) = _counted(inputs, "q_start")
+    (start,) = counted(inputs, "q_start")
     config = PlannerConfig() if config is None else config
     check_config(config)
     start = checks.check_start(robot, world, start)
-    policy = _policy(planner, goal, world, config)
-    problem = _problem(robot, world, goal, start, policy, config)
+    policy = policy_of(planner, goal, world, config)
+    problem = problem_of(robot, world, goal, start, policy, config)
     roots = start[None]
     if q_guess is not None:
         if isinstance(goal, ConfigurationGoal):
@@ -124,7 +124,7 @@ def plan(
     if isinstance(problem, ConfigurationGoal):
         return plan_to_goal(robot, world, problem, policy, start, key, config, on_progress)
     result = plan_by_loss(robot, world, problem, policy, roots, key, config, on_progress)
-    return _drawn(result, goal, robot)
+    return drawn(result, goal, robot)
 
 
 @single_precision
@@ -165,120 +165,6 @@ def plan_to_configuration(
     return plan(robot, world, goal, q_start, **run)
 
 
-@overload
-def plan_batch(
-    robot: Robot,
-    world: World | Sequence[World],
-    goals: Sequence[ImageGoal | ConfigurationGoal | Goal],
-    q_starts: np.ndarray,
-    *,
-    key: jax.Array,
-    planner: str | ExpansionPolicy | None = None,
-    config: PlannerConfig | None = None,
-    devices: Sequence[Any] | None = None,
-    on_progress: Progress = None,
-) -> list[PlanResult]: ...
-@overload
-def plan_batch(
-    robot: Robot,
-    world: World,
-    self_model: SelfModel,
-    camera: Camera | Sequence[Camera],
-    goal_images: Sequence[Image],
-    q_starts: np.ndarray,
-    /,
-    *,
-    key: jax.Array,
-    planner: str | ExpansionPolicy | None = None,
-    config: PlannerConfig | None = None,
-    devices: Sequence[Any] | None = None,
-    on_progress: Progress = None,
-) -> list[PlanResult]: ...
-@single_precision
-def plan_batch(
-    robot: Robot,
-    world: World | Sequence[World],
-    goals: Any,
-    *inputs: Any,
-    q_starts: np.ndarray | None = None,
-    key: jax.Array,
-    planner: str | ExpansionPolicy | None = None,
-    config: PlannerConfig | None = None,
-    devices: Sequence[Any] | None = None,
-    on_progress: Progress = None,
-) -> list[PlanResult]:
-    """Solve Q problems of one robot at once.
-
-    Call it as ``plan_batch(robot, world, goals, q_starts, key=key)``, or with a self-model, a
-    camera and Q goal images instead of the goals. Problem ``i`` uses the key ``fold_in(key, i)``.
-
-    Joint goals are planned on as many threads as there are cores, each in its own world if Q worlds
-    are given. Goals that are known by their loss are searched for by an outer ``vmap``, in one
-    world and with one attempt each; their search times hold the search of the whole batch. On a
-    CPU a loop over :func:`plan` is as fast for these; on other devices the batch pays.
-
-    Args:
-        robot: from :func:`load_robot`.
-        world: for this robot; or Q of them, for joint goals.
-        goals: Q goals that differ in numbers only, such as image goals of one camera.
-        inputs: ``q_starts``, unless it is given by name.
-        q_starts: (Q, D) start configurations.
-        key: random key.
-        planner: see :func:`plan`.
-        config: settings, the default ones if None.
-        devices: that share out the problems, such as ``jax.devices()``; the usual one if None. Each
-            compiles programs of its own.
-        on_progress: called with the batched search state and the seconds so far.
-
-    Raises:
-        ValueError: an input makes no sense; the message names the problem.
-    """
-    inputs = inputs if q_starts is None else (*inputs, q_starts)
-    if isinstance(goals, SelfModel):
-        camera, images, *rest = _counted(inputs, "camera", "goal_images", "q_starts")
-        inputs = tuple(rest)
-        goals = [ImageGoal(goals, camera, image) for image in images]
-    (all_starts,) = _counted(inputs, "q_starts")
-    config = PlannerConfig() if config is None else config
-    check_config(config)
-    worlds = [world] * len(goals) if isinstance(world, World) else list(world)
-    if len(goals) != len(worlds):
-        raise ValueError(f"got {len(worlds)} worlds and {len(goals)} goals; expected as many")
-    if len(goals) != len(all_starts) or len(goals) == 0:
-        raise ValueError(
-            f"got {len(goals)} goals and {len(all_starts)} starts; expected as many, and one at "
-            "least"
-        )
-    devices = list(jnp.zeros(()).devices() if devices is None else devices)
-    if not devices:
-        raise ValueError("devices is an empty list; expected one at least, such as jax.devices()")
-    policy = _policy(planner, goals[0], worlds[0], config)
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(goals)))
-    starts: list[np.ndarray] = []
-    checked: list[Any] = []
-    for i, (own, goal, q_start) in enumerate(zip(worlds, goals, all_starts, strict=True)):
-        try:
-            if isinstance(goal, ConfigurationGoal) != isinstance(goals[0], ConfigurationGoal):
-                raise ValueError(
-                    f"the goal is an object of {type(goal).__name__}, that of problem 0 of "
-                    f"{type(goals[0]).__name__}; expected goals of one kind"
-                )
-            starts.append(checks.check_start(robot, own, q_start))
-            checked.append(_problem(robot, own, goal, starts[-1], policy, config))
-        except ValueError as error:
-            raise ValueError(f"problem {i}: {error}") from None
-    if isinstance(goals[0], ConfigurationGoal):
-        return plan_each_to_configuration(
-            robot, worlds, checked, policy, starts, keys, config, devices, on_progress
-        )
-    if any(own is not worlds[0] for own in worlds):
-        raise ValueError("goals known by their loss are searched for in one world; got several")
-    results = plan_batch_by_loss(
-        robot, worlds[0], checked, policy, starts, keys, config, devices, on_progress
-    )
-    return [_drawn(result, goal, robot) for result, goal in zip(results, goals, strict=True)]
-
-
 @single_precision
 def plan_waypoints(
     robot: Robot,
@@ -317,7 +203,7 @@ def plan_waypoints(
         raise ValueError("the goals are an empty list; expected one at least")
     for i, goal in enumerate(goals):
         try:
-            _problem(robot, world, goal, q_start, _policy(None, goal, world, config), config)
+            problem_of(robot, world, goal, q_start, policy_of(None, goal, world, config), config)
         except ValueError as error:
             raise ValueError(f"goal {i}: {error}") from None
     legs: list[PlanResult] = []
@@ -330,13 +216,13 @@ def plan_waypoints(
     return legs
 
 
-def _drawn(result: PlanResult, goal: AnyGoal, robot: Robot) -> PlanResult:
+def drawn(result: PlanResult, goal: AnyGoal, robot: Robot) -> PlanResult:
     """A result that notebooks show with its goal image, if there is one."""
     draw = EndPicture(goal, robot) if isinstance(goal, ImageGoal) else None
     return dataclasses.replace(result, draw=draw)
 
 
-def _policy(
+def policy_of(
     planner: str | ExpansionPolicy | None, goal: AnyGoal, world: World, config: PlannerConfig
 ) -> ExpansionPolicy:
     """The policy of a planner by name, or the object itself.
@@ -362,7 +248,7 @@ def _policy(
     return PLANNERS[planner].for_world(world, lanes=config.tree.lanes)
 
 
-def _problem(
+def problem_of(
     robot: Robot,
     world: World,
     goal: AnyGoal,
@@ -414,11 +300,16 @@ def _image_goal(
     self_model: SelfModel, inputs: tuple[Any, ...], mask: Image | None
 ) -> tuple[ImageGoal, tuple[Any, ...]]:
     """The goal of the second form of :func:`plan`, and what follows it."""
-    camera, image, *rest = _counted(inputs, "camera", "goal_image", "q_start")
+    camera, image, *rest = counted(inputs, "camera", "goal_image", "q_start")
     return ImageGoal(self_model, camera, image, mask), tuple(rest)
 
 
-def _counted(inputs: tuple[Any, ...], *names: str) -> tuple[Any, ...]:
+def counted(inputs: tuple[Any, ...], *names: str) -> tuple[Any, ...]:
+    """What follows the goal.
+
+    Raises:
+        ValueError: it is not as many things as these names.
+    """
     if len(inputs) != len(names):
         raise ValueError(f"got {len(inputs)} inputs after the goal; expected {', '.join(names)}")
     return inputs

@@ -141,7 +141,7 @@ def test_bad_input_is_one_clear_line_and_writes_nothing(tmp_path, problem_copy, 
     expect("does not see the robot", "--problem", change(views=[view]))
     expect("unknown robot", "--problem", change(robot="pandaa"))
     expect("no world at", "--problem", change(world="none.xml"))
-    expect("lacks the field 'start'", "--problem", change(start=None) and _without(folder, "start"))
+    expect("lacks the field start", "--problem", change(start=None) and _without(folder, "start"))
     (folder / "problem.json").write_text('{"robot": ')
     expect("not valid JSON", "--problem", folder)
 
@@ -168,7 +168,7 @@ def test_other_robots_and_damaged_self_models_are_refused(tmp_path, problem_copy
     (tmp_path / "cut.npz").write_bytes(data[: len(data) // 2])
     change(self_model=str(tmp_path / "cut.npz"))
     code, error = bad(capsys, "plan", "--problem", folder, "--out", tmp_path / "out")
-    assert code == 2 and "not a readable self-model" in error
+    assert code == 2 and "cut.npz' is no readable .npz" in error
     change(self_model=str(tmp_path / "none.npz"))
     code, error = bad(capsys, "plan", "--problem", folder, "--out", tmp_path / "out")
     assert code == 2 and "no self-model at" in error

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from vrrt_jax import checks, planner
+from vrrt_jax.batch import plan_batch
 from vrrt_jax.bench.arm_problems import ArmProblems
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.goal import ConfigurationGoal
@@ -246,7 +247,7 @@ def batch_rate(
         batch = batches[number]
         worlds: Any = [trial.world for trial in batch]
         with uninterrupted():
-            results = planner.plan_batch(
+            results = plan_batch(
                 robot,
                 worlds,
                 [ConfigurationGoal(q=trial.q_goal) for trial in batch],

@@ -15,6 +15,7 @@ _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
+_TOLD = 8  # names in a message
 _SMALL = 1 << 26  # bytes that there always are
 MOST_WEIGHTS = 1 << 27  # bytes of what networks and splats have learned
 # What NumPy and zipfile raise for what is damaged; RuntimeError is of archives with a password.
@@ -57,8 +58,9 @@ def read_arrays(path: str | Path, *needed: str, most: int | None = None) -> dict
             f"'{path}' is no readable .npz of arrays ({text}); expected one that numpy.savez wrote"
         ) from None
     if missing := [name for name in needed if name not in arrays]:
+        has = [*arrays][:_TOLD] + ["..."] * (len(arrays) > _TOLD)
         raise ValueError(
-            f"'{path}' lacks the array {', '.join(missing)}; it has: {', '.join(arrays) or 'none'}"
+            f"'{path}' lacks the array {', '.join(missing)}; it has: {', '.join(has) or 'none'}"
         )
     return arrays
 

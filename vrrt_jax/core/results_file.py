@@ -29,9 +29,10 @@ def resume(file: Path, header: Mapping[str, Any], fresh: dict[str, Any]) -> dict
     try:
         results = read_json(file)
         old = {name: results[name] for name in header}
-        missing = [name for name in fresh if name not in results]
-        if missing or any(type(results[name]) is not type(fresh[name]) for name in fresh):
-            raise ValueError(f"it lacks {', '.join(missing) or 'what a run writes'}")
+        own = [name for name in fresh if name not in header]
+        missing = [name for name in own if type(results.get(name)) is not type(fresh[name])]
+        if missing:
+            raise ValueError(f"it lacks {', '.join(missing)} as a run writes it")
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"'{file}' is no results file of this version ({error!r}); choose another --json"

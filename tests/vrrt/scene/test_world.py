@@ -175,7 +175,7 @@ def test_world_files(tmp_path):
     file.write_text("<mujoco><worldbo")
     with pytest.raises(ValueError, match="not a valid MJCF"):
         load_obstacles(file)
-    with pytest.raises(FileNotFoundError, match="cannot read the world"):
+    with pytest.raises(FileNotFoundError, match="there is no such file"):
         load_obstacles(tmp_path / "nowhere.xml")
 
 
