@@ -50,7 +50,7 @@ STOPS = {
         ),
     ),
     "nrp": (
-        *("nrp_jax.planner._searched", "nrp_jax.bench.curves.in_processes"),
+        *("nrp_jax.planner._searched", "nrp_jax.bench.curves.in_workers"),
         *("nrp_jax.bench.score.score_homes", "nrp_jax.learning.train.run_epochs"),
         "nrp_jax.online.train_online",
     ),
