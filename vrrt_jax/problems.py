@@ -198,10 +198,10 @@ def views_of(photos: Sequence[Photo]) -> dict[str, Any]:
 def _load_view(folder: Path, view: dict[str, Any]) -> Photo:
     """A view of a problem's folder."""
     camera = view["camera"]
-    camera = _beside(folder, camera, "camera") if isinstance(camera, str) else camera
-    image = read_image(_beside(folder, view["image"], "image"))
+    camera = _file_beside(folder, camera, "camera") if isinstance(camera, str) else camera
+    image = read_image(_file_beside(folder, view["image"], "image"))
     mask = view.get("mask")
-    mask = None if mask is None else read_image(_beside(folder, mask, "mask"))
+    mask = None if mask is None else read_image(_file_beside(folder, mask, "mask"))
     return load_photo(image, camera, mask=mask)
 
 
@@ -218,6 +218,20 @@ def _checked_views(views: Any, file: Path) -> list[dict[str, Any]]:
         if missing := [name for name in VIEW_FIELDS[:2] if name not in view]:
             raise ValueError(f"view {index} of '{file}' lacks the field {missing[0]}")
     return views
+
+
+def _file_beside(folder: Path, name: Any, what: str) -> str:
+    """See :func:`_beside`; here it must be a file that is there.
+
+    Raises:
+        FileNotFoundError: it is not.
+    """
+    path = _beside(folder, name, what)
+    if not Path(path).exists():
+        raise FileNotFoundError(
+            f"the {what} '{name}' of the problem in '{folder}' is neither there nor at that path"
+        )
+    return path
 
 
 def _beside(folder: Path, name: Any, what: str) -> str:

@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import itertools
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -141,9 +141,13 @@ def read_poses(file: Path, robot: MobileRobot, key: str | None = None) -> dict[s
     for name, value in named.items():
         if key not in (None, name) or _is_text(value):
             continue
-        rows = value if np.ndim(value) == 2 else [value]
+        try:
+            value = np.asarray(value, float)
+        except (TypeError, ValueError):
+            raise ValueError(f"pose '{name}' in '{file}' is no list of numbers") from None
+        rows = value if value.ndim == 2 else [value]
         for index, row in enumerate(rows):
-            called = name if np.ndim(value) == 1 else f"{name} {index}"
+            called = name if value.ndim == 1 else f"{name} {index}"
             poses[called] = check_shape(robot, row, f"pose '{called}' in '{file}'")
     if len(poses) < 2:
         raise ValueError(f"'{file}' has {len(poses)} poses; expected two at least")
@@ -151,7 +155,10 @@ def read_poses(file: Path, robot: MobileRobot, key: str | None = None) -> dict[s
 
 
 def _is_text(value: Any) -> bool:
-    return isinstance(value, str) or any(isinstance(part, str) for part in np.atleast_1d(value))
+    if isinstance(value, np.ndarray):
+        value = value.ravel()
+    parts = [value] if isinstance(value, str) or not isinstance(value, Iterable) else value
+    return any(isinstance(part, str) for part in parts)
 
 
 def _fitting(robot: MobileRobot, grid: Grid) -> Grid:
