@@ -9,6 +9,7 @@ import numpy as np
 from vrrt_jax.core.arrays_file import read_arrays
 from vrrt_jax.core.data_file import of_file
 
+FARTHEST = 1e9  # [m] that a map may lie away from 0
 RESOLUTION = 0.1  # side of the cells that planners and networks expect [m]
 HEIGHT = 2.0  # of the maps [m]; homes end there
 
@@ -46,8 +47,11 @@ class Grid:
         if not (np.isfinite(resolution) and resolution > 0):
             raise ValueError(f"the map's resolution is {resolution}; expected meters, such as 0.1")
         origin = tuple(float(v) for v in self.origin)
-        if len(origin) not in (2, 3) or not np.isfinite(origin).all():
-            raise ValueError(f"the map's origin is {origin}; expected x, y and perhaps z in meters")
+        if len(origin) not in (2, 3) or not (np.abs(origin) <= FARTHEST).all():
+            raise ValueError(
+                f"the map's origin is {origin}; expected x, y and perhaps z in meters, within "
+                f"{FARTHEST:g} m of 0"
+            )
         if occupied.ndim == 2:
             occupied = occupied[:, :, None]
         object.__setattr__(self, "occupied", occupied.astype(bool, copy=False))

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from nrp_jax.homes.grid import Grid, coarsened, part_of
+from nrp_jax.homes.grid import FARTHEST, Grid, coarsened, part_of
 from nrp_jax.homes.memory import check_memory
 from vrrt_jax.core.data_file import read_yaml
 from vrrt_jax.core.pictures import open_picture
 
 _MODES = ("trinary", "scale", "raw")
-_FARTHEST = 1e9  # [m] that a map may lie away from 0
 _FIELDS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
 _UNKNOWN = 205  # gray that map savers write for unknown
 _STRIP = 1 << 22  # pixels converted at a time
@@ -112,8 +111,8 @@ def _origin(value: Any) -> tuple[float, float]:
     x, y, yaw = (_number(part, "origin") for part in value)
     if abs(math.remainder(yaw, 2 * math.pi)) > 1e-6:
         raise ValueError(f"it is turned by {yaw} rad; rotate the image and set yaw to 0")
-    if max(abs(x), abs(y)) > _FARTHEST:
-        raise ValueError(f"its origin is {value!r}; expected places within {_FARTHEST:g} m of 0")
+    if max(abs(x), abs(y)) > FARTHEST:
+        raise ValueError(f"its origin is {value!r}; expected places within {FARTHEST:g} m of 0")
     return x, y
 
 

@@ -95,4 +95,5 @@ def _read_array(file: IO[bytes], size: int, name: str) -> np.ndarray:
     if len(content) != there:
         raise EOFError(f"the array '{name}' is cut off")
     flat = np.frombuffer(content, dtype, count=math.prod(shape))
+    flat = flat.astype(dtype.newbyteorder("="), copy=False)  # JAX knows no other order of bytes
     return flat.reshape(shape, order="F" if is_fortran else "C")
