@@ -32,7 +32,7 @@ from fuzz_damage import damage
 SECONDS, SILENT_SECONDS, BYTES = 30, 90, 1 << 30  # that a command may take
 WORDS = ("allow_pickle", "Traceback", "object at 0x")  # that mean nothing to users
 # What may be named in place of the damaged file, where that says where the robot should be.
-NAMED = ("--", "the start", "the goal", "configuration", "at home", "self-model")
+NAMED = ("--", "camera 0", "the start", "the goal", "configuration", "at home", "self-model")
 
 
 class Read(BaseException):

@@ -101,7 +101,7 @@ def _written(found: Sequence[dict[str, Any]], folder: Path) -> Path:
             seen = results.get("self_model")
             seen = f"self-model {seen}" if seen else "an earlier self-model"
             parts += [f"`{_command(results)}`{where}, {seen}", "", to_text(results), ""]
-        name = f"{what}_{robot}.png"
+        name = re.sub(r"[^\w.-]", "_", f"{what}_{robot}.png")  # it stays in the folder
         if what == "ablation":
             _ablation_figure(group, folder / name)
             parts += [f"![success and causes of failure by setting]({name})", ""]

@@ -22,6 +22,7 @@ _COUNTS = {
     "composite": (("count",), 10**5),
     "size": (("nkey",), 10**5),
 }
+_LARGEST = 1e30
 _COPIES = 10**5  # of what stands in <replicate>, one inside the other
 
 
@@ -96,14 +97,14 @@ def _check_end(place: Path, name: str) -> None:
 
 
 def check_number(part: ElementTree.Element, key: str, text: str) -> None:
-    """Raise a ValueError for numbers of which one is none; MuJoCo would go on with it."""
+    """Raise a ValueError for numbers of which one is none, or too large for float32."""
     try:
         numbers = [float(word) for word in text.split()]
     except ValueError:
         return
-    if any(map(math.isnan, numbers)):
+    if any(math.isnan(x) or _LARGEST < abs(x) < math.inf for x in numbers):
         what = f"{part.tag} '{part.get('name', '')}'"
-        raise ValueError(f'{what} has {key}="{text}"; expected numbers')
+        raise ValueError(f'{what} has {key}="{text}"; expected numbers up to {_LARGEST:g}')
 
 
 def _whole(text: str) -> int:

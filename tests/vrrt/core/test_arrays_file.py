@@ -45,7 +45,8 @@ def test_what_numpy_writes_comes_back(tmp_path):
         assert [*found] == [*arrays]
         for name, array in arrays.items():
             np.testing.assert_array_equal(found[name], array)
-            assert found[name].dtype == array.dtype and found[name].flags.writeable
+            assert found[name].dtype == array.dtype.newbyteorder("=")
+            assert found[name].flags.writeable
 
 
 def test_objects_are_never_unpickled(tmp_path):
