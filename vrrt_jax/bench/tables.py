@@ -1,5 +1,6 @@
 """Benchmark results as tables and figures, beside the paper's own numbers."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
