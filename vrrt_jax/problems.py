@@ -198,7 +198,7 @@ def views_of(photos: Sequence[Photo]) -> dict[str, Any]:
 def _load_view(folder: Path, view: dict[str, Any]) -> Photo:
     """A view of a problem's folder."""
     camera = view["camera"]
-    camera = _file_beside(folder, camera, "camera") if isinstance(camera, str) else camera
+    camera = camera if isinstance(camera, dict) else _file_beside(folder, camera, "camera")
     image = read_image(_file_beside(folder, view["image"], "image"))
     mask = view.get("mask")
     mask = None if mask is None else read_image(_file_beside(folder, mask, "mask"))
