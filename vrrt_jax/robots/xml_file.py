@@ -102,8 +102,9 @@ def check_number(part: ElementTree.Element, key: str, text: str) -> None:
         numbers = [float(word) for word in text.split()]
     except ValueError:
         return
-    largest = math.inf if "range" in key else _LARGEST  # a joint may turn for ever
-    if any(math.isnan(x) or _LARGEST < abs(x) < math.inf or abs(x) > largest for x in numbers):
+    # Limits may be infinite: a joint may turn for ever.
+    endless = key in ("size", "pos", "fromto") and math.inf in map(abs, numbers)
+    if endless or any(math.isnan(x) or _LARGEST < abs(x) < math.inf for x in numbers):
         what = f"{part.tag} '{part.get('name', '')}'"
         raise ValueError(f'{what} has {key}="{text}"; expected numbers up to {_LARGEST:g}')
 
