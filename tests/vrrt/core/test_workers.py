@@ -69,7 +69,7 @@ def test_workers_of_a_cluster_come_and_go(cluster, tmp_path):
             cluster.remove_node(min(cluster.worker_nodes, key=id), allow_graceful=False)
     assert sorted(results) == [item * item for item in ITEMS]
     times = collections.Counter(item for item, _ in _begun(log))
-    assert sum(times.values()) <= len(ITEMS) + 2 and times[killed] == 2
+    assert sum(times.values()) <= len(ITEMS) + 2 and times[killed] >= 2
 
 
 def test_what_goes_wrong_on_a_cluster_is_told_as_here(cluster, tmp_path):
