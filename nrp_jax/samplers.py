@@ -228,15 +228,13 @@ def load_sampler(task: str, kind: str, path: str | Path | None = None, **setting
     """
     path = packaged_file(task, kind) if path is None else Path(path)
     if kind == FIRE:
-        sampler = ExperienceSampler(load_robot(task), load_database(path, task), **settings)
-    else:
-        check_choices(task, kind)
-        model = load_model(path)
-        check_model(model, path, task=task, kind=kind)
-        if type(model.info.get("num_outputs")) is not int:
-            raise ValueError(f"'{path}' does not say how many outputs its network has")
-        sampler = make_sampler(model, **settings)
-    return sampler
+        return ExperienceSampler(load_robot(task), load_database(path, task), **settings)
+    check_choices(task, kind)
+    model = load_model(path)
+    check_model(model, path, task=task, kind=kind)
+    if type(model.info.get("num_outputs")) is not int:
+        raise ValueError(f"'{path}' does not say how many outputs its network has")
+    return make_sampler(model, **settings)
 
 
 @contextlib.contextmanager

@@ -21,6 +21,14 @@ def random_grid(seed: int, size: int = 60, height: int = 1, boxes: int = 14):
     return Grid(occupied=occupied)
 
 
+def two_rooms():
+    """Two rooms and a door of one meter."""
+    occupied = np.zeros((50, 40), bool)
+    occupied[24:26] = True
+    occupied[24:26, 25:35] = False
+    return Grid(occupied=occupied)
+
+
 def free(world, q: np.ndarray) -> np.ndarray:
     """Which configurations (n, D) are free, in blocks of one size: one program for all."""
     block = 2048

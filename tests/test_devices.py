@@ -1,8 +1,6 @@
 """Batches that several devices share out: four that the processor stands in for."""
 
-import os
-import subprocess
-import sys
+from scripts import output_of
 
 SCRIPT = """
 import jax, jax.numpy as jnp, numpy as np
@@ -50,17 +48,6 @@ print("goals known by their loss")
 
 
 def test_devices_share_out_a_batch():
-    environment = {
-        **os.environ,
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=4",
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-        "JAX_COMPILATION_CACHE_DIR": os.path.expanduser("~/.cache/vrrt_jax_tests"),
-    }
-    done = subprocess.run(
-        [sys.executable, "-W", "error::UserWarning", "-c", SCRIPT],
-        capture_output=True,
-        text=True,
-        env=environment,
-        timeout=500,
+    assert "known by their loss" in output_of(
+        SCRIPT, XLA_FLAGS="--xla_force_host_platform_device_count=4"
     )
-    assert done.returncode == 0 and "known by their loss" in done.stdout, done.stdout + done.stderr

@@ -1,8 +1,6 @@
 """Both packages where JAX is set to 64 bit: everything is computed in float32 all the same."""
 
-import os
-import subprocess
-import sys
+from scripts import output_of
 
 SCRIPT = """
 import jax, jax.numpy as jnp, numpy as np
@@ -46,17 +44,4 @@ print("all in float32")
 
 
 def test_64_bit_changes_nothing():
-    environment = {
-        **os.environ,
-        "JAX_ENABLE_X64": "1",
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-        "JAX_COMPILATION_CACHE_DIR": os.path.expanduser("~/.cache/vrrt_jax_tests"),
-    }
-    done = subprocess.run(
-        [sys.executable, "-W", "error::UserWarning", "-c", SCRIPT],
-        capture_output=True,
-        text=True,
-        env=environment,
-        timeout=500,
-    )
-    assert done.returncode == 0 and "all in float32" in done.stdout, done.stderr
+    assert "all in float32" in output_of(SCRIPT, JAX_ENABLE_X64="1")

@@ -34,7 +34,8 @@ class ExactScene:
     def __init__(self, robot: MobileRobot, grid: Grid):
         """Compile the scene; the snake sees the planar map."""
         spec = mujoco.MjSpec.from_string(robot.xml)
-        boxes_to_meshes(spec)
+        with COMPILING:
+            boxes_to_meshes(spec)
         if robot.planar:
             grid = grid.flatten()
         self.robot = robot

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from nrp_synthetic import two_rooms
 
 import nrp_jax
 
@@ -18,11 +19,7 @@ def snake():
 
 @pytest.fixture(scope="module")
 def home():
-    """Two rooms and a door of one meter."""
-    occupied = np.zeros((50, 40), bool)
-    occupied[24:26] = True
-    occupied[24:26, 25:35] = False
-    return nrp_jax.Grid(occupied=occupied)
+    return two_rooms()
 
 
 def test_plans_are_those_of_single_calls(snake, home):

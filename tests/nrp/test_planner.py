@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from nrp_synthetic import two_rooms
 
 import nrp_jax
 from nrp_jax import planner, viz
@@ -33,11 +34,7 @@ def snake():
 
 @pytest.fixture(scope="module")
 def home():
-    """Two rooms and a door of one meter."""
-    occupied = np.zeros((50, 40), bool)
-    occupied[24:26] = True
-    occupied[24:26, 25:35] = False
-    return nrp_jax.Grid(occupied=occupied)
+    return two_rooms()
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 """Joint angles from photographs in the DREAM format: the paper's table of errors by joint."""
 
+import bisect
 import dataclasses
 import functools
 import time
@@ -115,7 +116,8 @@ def run(
     # What was refused is tried again: its files may have been mended.
     results["rows"] = [row for row in results["rows"] if "refused" not in row]
     _check_done(benchmark.folder, results["rows"])
-    done = {(row["frame"], row["level"]) for row in results["rows"]}
+    results["rows"].sort(key=_key)  # and so they stay, whatever comes first
+    done = {_key(row) for row in results["rows"]}
     todo = [
         (name, level)
         for name in benchmark.frames
@@ -124,16 +126,17 @@ def run(
     ]
     with tqdm(total=len(todo), unit="frame", disable=None) as bar:
         for row in in_workers(partial(_run_frame, benchmark), todo, jobs, cluster):
-            # In the order of frames, whatever came first.
-            results["rows"] = sorted(
-                [*results["rows"], row], key=lambda r: (r["frame"], r["level"])
-            )
+            bisect.insort(results["rows"], row, key=_key)
             results["levels"] = summarize(results["rows"])
             if file is not None:
                 write(Path(file), results)
             bar.update()
     results["levels"] = summarize(results["rows"])
     return results
+
+
+def _key(row: dict[str, Any]) -> tuple[str, float]:
+    return row["frame"], row["level"]
 
 
 def _check_done(folder: str, rows: list[dict[str, Any]]) -> None:

@@ -1,5 +1,6 @@
 """Run many tasks: streamed to a file, resumed from it, over several processes."""
 
+import bisect
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -102,13 +103,14 @@ def run(
         for variant in benchmark.variants
         if (variant.name, level, index) not in done
     ]
+    # Rows stand in the order of tasks, whatever comes first.
     order = partial(_place, benchmark)
+    results["tasks"].sort(key=order)
     with tqdm(total=len(todo), unit="task", disable=None) as bar:
         won = 0
         rows = in_workers(partial(_run_task, benchmark), todo, jobs, cluster)
         for count, row in enumerate(rows, 1):
-            # In the order of tasks, whatever came first.
-            results["tasks"] = sorted([*results["tasks"], row], key=order)
+            bisect.insort(results["tasks"], row, key=order)
             results.update(_summary(benchmark, results["tasks"]))
             if file is not None:
                 write(Path(file), results)

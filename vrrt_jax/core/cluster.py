@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 
+from vrrt_jax.core.compiling import keep_programs
 from vrrt_jax.core.timing import versions
 
 LOCAL = "local"  # the address that stands for this machine alone, also for Ray
@@ -95,7 +96,9 @@ def _result(ray: Any, finished: Any) -> Any:
         ) from None
 
 
-def _call(function: Callable[[Any], Any], item: Any, wanted: dict[str, str], cache: str) -> Any:
+def _call(
+    function: Callable[[Any], Any], item: Any, wanted: dict[str, str], cache: str | None
+) -> Any:
     """On a worker: the result for an item."""
     if not _core:
         here = versions()
@@ -106,8 +109,7 @@ def _call(function: Callable[[Any], Any], item: Any, wanted: dict[str, str], cac
                 "different versions are not mixed; install the same there"
             )
         jax.config.update("jax_enable_x64", False)
-        jax.config.update("jax_compilation_cache_dir", cache)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        keep_programs(cache)
         _core.append(_take_core())
     return function(item)
 

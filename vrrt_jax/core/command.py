@@ -266,10 +266,11 @@ def _set_up_jax(name: str) -> None:
     """
     import jax
 
+    from vrrt_jax.core.compiling import keep_programs
+
     os.environ["JAX_ENABLE_X64"] = "0"  # also of worker processes
     jax.config.update("jax_enable_x64", False)
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    jax.config.update("jax_compilation_cache_dir", str(home / f"{name}_jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    keep_programs(str(home / f"{name}_jax"))

@@ -19,6 +19,13 @@ QUICK_TO_COMPILE = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emi
 # Not for what someone may call inside of a ``jax.jit`` of their own: JAX refuses options there.
 host_jit = functools.partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
 
+
+def keep_programs(folder: str | None) -> None:
+    """Keep compiled programs in a folder, small ones too; JAX's own setting if None."""
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
 _seen: set[Any] = set()  # the kinds that compile_together has been called with
 
 

@@ -12,6 +12,7 @@ import jax
 from vrrt_jax.core import command
 from vrrt_jax.core.cluster import on_cluster
 from vrrt_jax.core.command import end_with_parent
+from vrrt_jax.core.compiling import keep_programs
 from vrrt_jax.core.interrupt import of_parent_alone
 
 _function: list[Callable[[Any], Any]] = []  # of a worker process
@@ -22,7 +23,8 @@ def in_workers(
 ) -> Iterator[Any]:
     """What the function returns for the items; with one job in their order, otherwise as they come.
 
-    After a failure no item is begun; those under way are finished, and then it is raised.
+    After a failure no item is begun. Processes finish those under way before it is raised; what a
+    cluster has under way is dropped.
 
     Args:
         function: it is sent to each worker process once, so that it may hold what is large.
@@ -74,8 +76,7 @@ def _begin(function: Callable[[Any], Any], cores: Any, cache: str | None) -> Non
     """Give a worker cores of its own, or several would fight for all; and the parent's programs."""
     end_with_parent()
     os.sched_setaffinity(0, cores.get())
-    jax.config.update("jax_compilation_cache_dir", cache)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    keep_programs(cache)
     _function.append(function)
 
 

@@ -18,7 +18,7 @@ def box_mesh(spec: mujoco.MjSpec, name: str, size: np.ndarray) -> str:
 
 
 def boxes_to_meshes(spec: mujoco.MjSpec) -> None:
-    """Turn all boxes of a robot into meshes; see :func:`box_mesh`."""
+    """Turn all boxes of a robot into meshes, see :func:`box_mesh`; this compiles the robot."""
     boxes = [geom for geom in spec.geoms if geom.type == _GEOM.mjGEOM_BOX]
     if not boxes:
         return

@@ -6,6 +6,7 @@ import json
 import jax
 import numpy as np
 import pytest
+from nrp_synthetic import two_rooms
 
 import nrp_jax
 from nrp_jax.bench import curve_homes, ompl_peers
@@ -24,11 +25,7 @@ POSES = {
 
 @pytest.fixture(scope="module")
 def home():
-    """Two rooms and a door of one meter."""
-    occupied = np.zeros((50, 40), bool)
-    occupied[24:26] = True
-    occupied[24:26, 25:35] = False
-    return nrp_jax.Grid(occupied=occupied)
+    return two_rooms()
 
 
 @pytest.fixture(scope="module")

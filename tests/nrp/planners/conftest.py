@@ -1,7 +1,7 @@
 """What tests of planners share."""
 
-import numpy as np
 import pytest
+from nrp_synthetic import two_rooms
 
 import nrp_jax
 
@@ -13,9 +13,5 @@ def snake():
 
 @pytest.fixture(scope="module")
 def home(snake):
-    """Two rooms and a door of one meter."""
-    occupied = np.zeros((50, 40), bool)
-    occupied[24:26] = True
-    occupied[24:26, 25:35] = False
-    grid = nrp_jax.Grid(occupied=occupied)
+    grid = two_rooms()
     return grid, nrp_jax.build_world(snake, grid)
