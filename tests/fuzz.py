@@ -4,7 +4,7 @@
 the code that users run; what comes after the reading (searches, training, the browser) is left out.
 An answer is as it should be if the command goes on, or ends with the exit code 2 and one line that
 names what is wrong; no input changes, and time and memory stay bounded. A worker does the work, so
-that what kills it is told too.
+that what kills it is told too. With ``--options`` the files stay as they are, and options are odd.
 """
 
 import argparse
@@ -26,6 +26,7 @@ from unittest import mock
 if __name__ == "__main__":  # the packages and the inputs lie beside this file
     sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
 
+import fuzz_options
 import numpy as np
 from fuzz_damage import damage
 
@@ -48,11 +49,16 @@ STOPS = {
             "vrrt_jax.splat.mujoco_images.MeshRenderer.picture",
             "vrrt_jax.robots.robot_fit.fit_spheres",
         ),
+        *("vrrt_jax.bench.runner.in_workers", "vrrt_jax.bench.pose_ambiguity.draw"),
+        *(f"vrrt_jax.bench.{name}.run" for name in ("kinematics", "raster", "search")),
+        *("vrrt_jax.bench.pose_ambiguity.run", "vrrt_jax.doctor.findings"),
     ),
     "nrp": (
         *("nrp_jax.planner._searched", "nrp_jax.bench.curves.in_workers"),
         *("nrp_jax.bench.score.score_homes", "nrp_jax.learning.train.run_epochs"),
-        "nrp_jax.online.train_online",
+        *("nrp_jax.online.train_online", "nrp_jax.learning.shards.in_workers"),
+        *("nrp_jax.bench.checks.run", "nrp_jax.bench.planning.run"),
+        "nrp_jax.homes.figure.generate_house",
     ),
 }
 
@@ -64,6 +70,11 @@ class Inputs:
         """Write them."""
         import fuzz_inputs
 
+        import nrp_jax.cli
+        import vrrt_jax.cli
+
+        self.name = name
+        self.parser = {"vrrt": vrrt_jax.cli, "nrp": nrp_jax.cli}[name]._parser()
         self.folder, self.out = folder / "inputs", folder / "out"
         self.folder.mkdir()
         make = fuzz_inputs.vrrt_inputs if name == "vrrt" else fuzz_inputs.nrp_inputs
@@ -78,6 +89,14 @@ class Inputs:
         near = [file for file in self.files if self._is_read(file, place, words)]
         file = near[int(rng.integers(len(near)))]
         return file, damage(rng, file, self.files), self.written(words)
+
+    def odd_options(self, seed: int, number: int) -> tuple[Path, str, list[str]]:
+        """A command with odd options; returns a file that it may name, what was done, and it."""
+        rng = np.random.default_rng([seed, number, 1])
+        commands = [words for _, words in self.commands] + list(fuzz_options.BARE[self.name])
+        words = commands[int(rng.integers(len(commands)))]
+        words, done = fuzz_options.odd(rng, self.parser, words, self.files)
+        return self.folder, done, self.written(words)
 
     def written(self, words: list[str]) -> list[str]:
         """A command with the empty folder that it writes into."""
@@ -137,6 +156,11 @@ def reading_only(name: str):
         yield
 
 
+def _stderr():
+    """As Python opens it."""
+    return open(2, "w", errors="backslashreplace", closefd=False)
+
+
 def answer(name: str, words: list[str]) -> tuple[int | str, str, list[BaseException], list]:
     """Exit code (or "read"), what was written to the standard error, exceptions and warnings."""
     import nrp_jax.cli
@@ -163,7 +187,7 @@ def answer(name: str, words: list[str]) -> tuple[int | str, str, list[BaseExcept
         try:
             with (
                 mock.patch.object(command, "in_one_line", noted),
-                mock.patch.object(sys, "stderr", open(2, "w", closefd=False)),
+                mock.patch.object(sys, "stderr", _stderr()),
                 mock.patch.object(sys, "stdout", nowhere),
             ):
                 try:
@@ -189,7 +213,7 @@ def faults(inputs: Inputs, name: str, file: Path, words: list[str]) -> tuple[lis
     code, heard, errors, warned = answer(name, words)
     took = time.process_time() - started
     grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - most)
-    lines = [line for line in heard.splitlines() if "\r" not in line]
+    lines = [line for line in heard.split("\n") if line and "\r" not in line]
     found = []
     if code not in (0, 2, "read"):
         found.append(f"exit code {code}")
@@ -199,7 +223,10 @@ def faults(inputs: Inputs, name: str, file: Path, words: list[str]) -> tuple[lis
         found.append(f"unexpected {type(errors[-1]).__name__}")
     if said := [word for word in WORDS if word in heard]:
         found.append(f"says {said[0]!r}")
-    if code == 2 and not any(name in heard for name in (file.stem, file.parent.name, *NAMED)):
+    options = [word[2:].partition("=") for word in words if word.startswith("--")]
+    given = [part for name, _, value in options for part in (name, *value.split(","))]
+    named = (file.stem, file.parent.name, *NAMED, *(part[:99] for part in given))
+    if code == 2 and not any(name in heard for name in named if name):
         found.append("names nothing that was given")
     found += sorted(
         {f"{w.category.__name__}" for w in warned if not issubclass(w.category, UserWarning)}
@@ -236,21 +263,25 @@ def inputs_of(name: str):
             os.chdir(here)
 
 
-def work(name: str, seed: int, numbers: range, say=lambda line: None) -> list[dict]:
-    """Try cases one after the other."""
+def work(
+    name: str, seed: int, numbers: range, say=lambda line: None, *, options: bool = False
+) -> list[dict]:
+    """Try cases one after the other: damaged files, or odd options."""
     rows = []
     with inputs_of(name) as inputs:
+        case = inputs.odd_options if options else inputs.case
         for number in numbers:
             say(json.dumps({"begin": number}))
-            rows.append({"number": number, **judged(inputs, name, *inputs.case(seed, number))})
+            rows.append({"number": number, **judged(inputs, name, *case(seed, number))})
             say(json.dumps(rows[-1]))
     return rows
 
 
-def watched(name: str, seed: int, count: int, first: int = 0):
+def watched(name: str, seed: int, count: int, first: int = 0, *flags: str):
     """Rows of a worker that is begun again where something kills it."""
     while first < count:
         words = ["--command", name, "--seed", seed, "--count", count, "--first", first, "--worker"]
+        words += flags
         worker = subprocess.Popen(
             [sys.executable, __file__, *map(str, words)], stdout=subprocess.PIPE, bufsize=0
         )
@@ -284,14 +315,17 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--all", action="store_true", help="print what is as it should be too")
+    parser.add_argument("--options", action="store_true", help="odd options, not damaged files")
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.worker:
         say = functools.partial(print, flush=True)
-        work(given.command, given.seed, range(given.first, given.count), say)
+        numbers = range(given.first, given.count)
+        work(given.command, given.seed, numbers, say, options=given.options)
         return 0
     bad = refused = 0
-    for row in watched(given.command, given.seed, given.count, given.first):
+    flags = ["--options"] * given.options
+    for row in watched(given.command, given.seed, given.count, given.first, *flags):
         bad += bool(row["faults"])
         refused += row["told"].startswith("2")
         if row["faults"] or given.all:

@@ -24,6 +24,29 @@ def test_every_answer_is_as_it_should_be(name):
 
 
 @pytest.mark.parametrize("name", ["vrrt", "nrp"])
+def test_odd_options_are_answered_as_they_should_be(name):
+    rows = fuzz.work(name, 20, range(COUNT), options=True)
+    assert [row for row in rows if row["faults"]] == []
+    assert sum(row["told"].startswith("2:") for row in rows) > COUNT // 2
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["spheres", "--robot=panda", "--num=two\nlines"],
+        ["spheres", "--robot=/proc/self/mem"],
+        ["spheres", "--robot=panda", "--out=\udcff.xml"],
+        ["spheres", "--robot=arm"],
+    ],
+)
+def test_options_that_once_failed_are_told_in_one_line(words):
+    with fuzz.inputs_of("vrrt") as inputs:
+        (inputs.folder.parent / "arm").write_text("<mujoco/>")
+        row = fuzz.judged(inputs, "vrrt", inputs.folder, "", words)
+    assert not row["faults"] and row["told"].startswith("2:"), row
+
+
+@pytest.mark.parametrize("name", ["vrrt", "nrp"])
 def test_valid_inputs_are_read_whole(name):
     """So what the fuzzer damages is what is refused."""
     with fuzz.inputs_of(name) as inputs:

@@ -51,7 +51,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """End with the exit code 2 and one line."""
-        self.exit(EXIT_BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
+        self.exit(EXIT_BAD_INPUT, f"{self.prog}: {_on_one_line(message)}; see {self.prog} --help\n")
 
 
 class _Defaults(argparse.ArgumentDefaultsHelpFormatter):
@@ -93,9 +93,7 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
 
 def in_one_line(error: Exception) -> str:
     """What went wrong, where, and what to do."""
-    text = " ".join(str(error).split())
-    if len(text) > _LONGEST:
-        text = f"{text[:_LONGEST]} ..."
+    text = _on_one_line(str(error))
     if isinstance(error, MemoryError):
         return (
             f"out of memory ({text or 'no more is to be had'}); close other programs, or ask for "
@@ -112,6 +110,11 @@ def in_one_line(error: Exception) -> str:
         f"{kind.__module__}.{kind.__qualname__}: {text or 'no message'}; check the files that were "
         "given, or see where it happened with VRRT_TRACEBACK=1"
     )
+
+
+def _on_one_line(text: str) -> str:
+    text = " ".join(text.split())
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
 
 
 def _check_outputs(arguments: argparse.Namespace) -> None:
@@ -176,9 +179,11 @@ def add_port(parser: argparse.ArgumentParser) -> None:
 
 
 def words(text: str) -> str:
-    """An argument that is not empty."""
+    """An argument that is not empty, and is UTF-8."""
     if not text.strip() or "\0" in text:
         raise argparse.ArgumentTypeError("the text is empty; expected a word or a path")
+    if any("\ud800" <= letter <= "\udfff" for letter in text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not UTF-8, so it cannot be written down")
     return text
 
 

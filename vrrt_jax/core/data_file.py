@@ -1,6 +1,7 @@
 """Files of fields: JSON, and YAML as OpenCV and ROS write it. Nothing is dropped in silence."""
 
 import contextlib
+import io
 import json
 import re
 from collections.abc import Iterator, Sequence
@@ -163,14 +164,21 @@ def read_text(path: str | Path, kind: str = "text") -> str:
         FileNotFoundError: no such file.
         ValueError: it is no UTF-8, or larger than any such file.
     """
+    content = read_bytes(path, kind)
+    try:
+        return io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig").read()
+    except UnicodeDecodeError as error:
+        told = f"{error.reason} at byte {error.start}"
+        raise ValueError(f"'{path}' is not valid {kind}: {told}; save it as UTF-8") from None
+
+
+def read_bytes(path: str | Path, kind: str) -> bytes:
+    """What a file holds that is read as a whole; arguments and errors of :func:`read_text`."""
     path = check_file(path)
     if (size := path.stat().st_size) > MOST_BYTES:
         raise ValueError(f"'{path}' has {size} bytes; expected {kind} of at most {MOST_BYTES}")
     try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        told = f"{error.reason} at byte {error.start}"
-        raise ValueError(f"'{path}' is not valid {kind}: {told}; save it as UTF-8") from None
+        return path.read_bytes()
     except OSError as error:
         raise FileNotFoundError(f"cannot read '{path}': {error.strerror}") from None
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.parsers import expat
 
-from vrrt_jax.core.data_file import MOST_BYTES, check_file
+from vrrt_jax.core.data_file import read_bytes
 
 _FOLDERS = ("meshdir", "texturedir", "assetdir")  # of <compiler>
 # What a file may ask for, by element: the product of some numbers is at most so large.
@@ -22,6 +22,7 @@ _COUNTS = {
     "composite": (("count",), 10**5),
     "size": (("nkey",), 10**5),
 }
+_SUFFIXES = (".xml", ".urdf")  # of what MuJoCo reads
 _LARGEST = 1e30
 _COPIES = 10**5  # of what stands in <replicate>, one inside the other
 
@@ -33,10 +34,7 @@ def xml_root(path: str | Path) -> ElementTree.Element | None:
         FileNotFoundError: no such file.
         ValueError: it is too large, or declares entities, of which few lines can make gigabytes.
     """
-    path = check_file(path)
-    if (size := path.stat().st_size) > MOST_BYTES:
-        raise ValueError(f"it has {size} bytes; expected at most {MOST_BYTES}")
-    content = path.read_bytes()
+    content = read_bytes(path, "XML")
     try:
         scanner = expat.ParserCreate()
         scanner.EntityDeclHandler = _refuse_entity
@@ -50,6 +48,8 @@ def check_mjcf(path: str | Path) -> None:
     """Raise what :func:`xml_root` does, or a ValueError for what MuJoCo should not try to read."""
     path = Path(path)
     root = xml_root(path)
+    if path.suffix not in _SUFFIXES:
+        raise ValueError(f"its name ends in '{path.suffix}'; expected .xml or .urdf: rename it")
     if root is None:
         return
     parts = list(_parts(root, path, {os.path.realpath(path)}))
