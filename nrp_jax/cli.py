@@ -194,3 +194,7 @@ def _record(problem, method: str, seed: int, result) -> dict:
         "path": [[round(float(v), 7) for v in q] for q in result.path],
         "trajectory": [[round(float(v), 7) for v in q] for q in result.trajectory],
     }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

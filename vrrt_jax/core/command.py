@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 from vrrt_jax.core.interrupt import EXIT_INTERRUPTED, ending_soon, is_command
 
 EXIT_SOLVED, EXIT_UNSOLVED, EXIT_BAD_INPUT = 0, 1, 2
+EXIT_UNREAD = 141  # as a shell says of what a closed pipe ends
 LARGEST = 1e9  # of numbers in lists
 _LONGEST = 600  # characters of a message
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -68,7 +69,8 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
     ``VRRT_TRACEBACK=1`` shows where it happened too.
 
     Returns:
-        The exit code: 0 solved or done, 1 not solved, 2 bad input, 130 interrupted.
+        The exit code: 0 solved or done, 1 not solved, 2 bad input, 130 interrupted, 141 if nobody
+        reads what is printed.
     """
     try:
         arguments = parser.parse_args(argv)
@@ -79,7 +81,13 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
         with ending_soon(name):
             _check_outputs(arguments)
             _set_up_jax(parser.prog)
-            return arguments.run(arguments)
+            code = arguments.run(arguments)
+            sys.stdout.flush()
+            return code
+    except BrokenPipeError:  # of what reads along, such as head
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())
+        return EXIT_UNREAD
     except Exception as error:
         print(f"{name}: {in_one_line(error)}", file=sys.stderr)
         if os.environ.get("VRRT_TRACEBACK"):

@@ -3,6 +3,8 @@
 import argparse
 import errno
 import json
+import subprocess
+import sys
 import zipfile
 
 import jax
@@ -95,3 +97,19 @@ def test_parsers_take_texts_and_numbers_only_in_range():
     for parse, text in ((command.whole(1, 5), "6"), (command.real(0, 1), "nan")):
         with pytest.raises(argparse.ArgumentTypeError, match="expected"):
             parse(text)
+
+
+@pytest.mark.parametrize("module", ["vrrt_jax", "nrp_jax", "vrrt_jax.cli", "nrp_jax.cli"])
+def test_modules_are_commands(module):
+    words = [sys.executable, "-m", module]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and "required: command" in done.stderr
+
+
+def test_nothing_is_said_where_nobody_reads():
+    """As of ``vrrt doctor | head -1``."""
+    words = [sys.executable, "-m", "vrrt_jax", "doctor"]
+    run = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert run.stdout is not None and run.stderr is not None
+    run.stdout.close()
+    assert run.stderr.read() == b"" and run.wait(timeout=60) == command.EXIT_UNREAD

@@ -1,0 +1,5 @@
+"""``python -m vrrt_jax`` is the command ``vrrt``."""
+
+from vrrt_jax.cli import main
+
+raise SystemExit(main())
