@@ -4,8 +4,11 @@ import pkgutil
 import re
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 
+import nrp_jax
 import vrrt_jax
 from vrrt_jax.outcome import ADVICE
 
@@ -33,6 +36,41 @@ def test_every_module_imports(package):
     found = importlib.import_module(package)
     for module in pkgutil.walk_packages(found.__path__, f"{package}."):
         importlib.import_module(module.name)
+
+
+def test_names_in_place_of_what_they_name_are_told():
+    panda = vrrt_jax.load_robot("panda")
+    world = vrrt_jax.build_world(panda, engine="closed_form")
+    home, key = panda.home, jax.random.key(0)
+    robot, room = r"the robot is 'panda'; .*load_robot", r"the world is 'open'; .*load_world"
+    with pytest.raises(ValueError, match=robot):
+        vrrt_jax.build_world("panda")
+    with pytest.raises(ValueError, match=robot):
+        vrrt_jax.plan_to_configuration("panda", world, home, home, key=key)
+    with pytest.raises(ValueError, match=room):
+        vrrt_jax.plan_to_configuration(panda, "open", home, home, key=key)
+    with pytest.raises(ValueError, match=robot):
+        vrrt_jax.verify_path("panda", [], home[None])
+    with pytest.raises(ValueError, match="the world is None"):
+        vrrt_jax.inverse_kinematics(panda, None, np.eye(4), key=key)
+    snake = nrp_jax.load_robot("snake")
+    with pytest.raises(ValueError, match=r"the map is 'home.npz'; .*nrp_jax.load_map"):
+        nrp_jax.plan(snake, "home.npz", np.zeros(8), np.zeros(8), key=key)
+
+
+def test_numbers_that_make_no_sense_are_told():
+    panda = vrrt_jax.load_robot("panda")
+    box = vrrt_jax.Obstacle(name="box", kind="box", position=(1, 1, 1), size=(0.1, 0.1, 0.1))
+    world = vrrt_jax.build_world(panda, [box], engine="closed_form")
+    with pytest.raises(ValueError, match="3 positive numbers"):
+        vrrt_jax.move_obstacle(world, "box", size=(0.1, 0.1, 0.1, 0.1))
+    with pytest.raises(ValueError, match="num is 2.5"):
+        vrrt_jax.inverse_kinematics(panda, world, np.eye(4), key=jax.random.key(0), num=2.5)
+    far = np.stack([panda.home, 1e6 * panda.home])
+    with pytest.raises(ValueError, match="check its units"):
+        vrrt_jax.verify_path(panda, [], far)
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        vrrt_jax.write_image("image.png", np.zeros((2, 2, 3)), np.full((2, 2), np.nan))
 
 
 def test_mjx_is_in_its_engine_alone():

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.check_protocols import overrides_is_free
+from vrrt_jax.core.fields import check_loaded
 from vrrt_jax.robots.kinematics import Chain, link_poses
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.attached import touching_spheres
@@ -28,6 +29,7 @@ def check_limits(robot: Robot, q: Any, what: str) -> np.ndarray:
     Raises:
         ValueError: names the joint, its value and its bounds.
     """
+    check_loaded(robot, "the robot", "vrrt_jax.load_robot")
     q, names = _array(q, what), robot.joint_names
     if q.shape != (len(names),):
         raise ValueError(
@@ -69,6 +71,8 @@ def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.n
     Raises:
         ValueError: names the joint, its value and its bounds, or the bodies that touch.
     """
+    check_loaded(robot, "the robot", "vrrt_jax.load_robot")
+    check_loaded(world, "the world", "vrrt_jax.build_world or vrrt_jax.load_world")
     if tuple(world.joint_names) != robot.joint_names:
         raise ValueError(
             f"the world is of a robot with joints {', '.join(world.joint_names)}; this one, "

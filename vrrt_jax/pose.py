@@ -10,6 +10,7 @@ from vrrt_jax import checks
 from vrrt_jax.config import PlannerConfig
 from vrrt_jax.core.compiling import host_jit
 from vrrt_jax.core.edges import enforce_bounds
+from vrrt_jax.core.fields import check_loaded
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.planners import RRTConnect
 from vrrt_jax.core.precision import single_precision
@@ -76,6 +77,8 @@ def inverse_kinematics(
         Unreached: there is none; a ValueError that says how near the link gets, or that all are in
             collision.
     """
+    if not (isinstance(num, int | np.integer) and num >= 1):
+        raise ValueError(f"num is {num!r}; expected a whole number, at least 1")
     return _solutions(robot, (world,), pose, link, key, q_near, num)
 
 
@@ -101,6 +104,8 @@ def _solutions(
         q_near: (D,) or None.
         num: at most so many.
     """
+    check_loaded(robot, "the robot", "vrrt_jax.load_robot")
+    check_loaded(rooms[0], "the world", "vrrt_jax.build_world or vrrt_jax.load_world")
     link = robot.link_names[-1] if link is None else link
     index, in_link = moving_body(robot, link)
     target = jnp.asarray(rigid(pose, "the pose") @ np.linalg.inv(in_link), jnp.float32)

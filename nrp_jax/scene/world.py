@@ -16,6 +16,7 @@ from nrp_jax.scene.field import make_field
 from nrp_jax.scene.grid_world import GridWorld, RoundBase
 from nrp_jax.scene.near_cells import make_near_cells
 from nrp_jax.scene.robots import MobileRobot
+from vrrt_jax.core.fields import check_loaded
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.robots.kinematics import Chain, Spheres, placement
 
@@ -64,6 +65,8 @@ def build_world(
     Raises:
         ValueError: a planar map for a robot that is not, or a setting that is not positive.
     """
+    check_loaded(robot, "the robot", "nrp_jax.load_robot")
+    check_loaded(grid, "the map", "nrp_jax.load_map")
     resolution = RESOLUTION[robot.name] if resolution is None else resolution
     arm_weight = ARM_WEIGHT[robot.name] if arm_weight is None else arm_weight
     for name, value in (

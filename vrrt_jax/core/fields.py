@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from pathlib import PurePath
 from typing import Any, get_args, get_origin, get_type_hints
 
 MOST = 2**53  # beyond it numbers of files are not whole any more
@@ -28,6 +29,18 @@ def check_fields(
         f"{what} has unknown fields: {', '.join(map(str, unknown))}; known ones: {', '.join(known)}"
         + "".join(f"; {text}" for text in told if text)
     )
+
+
+def check_loaded(value: Any, what: str, loader: str) -> None:
+    """Raise a ValueError where a name, a path or None stands for what has to be loaded first.
+
+    Args:
+        value: what was given.
+        what: its name in the error, such as "the robot".
+        loader: what gives one, such as "vrrt_jax.load_robot".
+    """
+    if value is None or isinstance(value, str | PurePath):
+        raise ValueError(f"{what} is {value!r}; expected what {loader} returns")
 
 
 def record_of(kind: type[Any], fields: Any, what: str) -> Any:

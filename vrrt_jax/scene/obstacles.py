@@ -223,7 +223,7 @@ def check_obstacle(obstacle: Obstacle) -> None:
             "is not turned"
         )
     needed = KINDS[obstacle.kind].num_sizes
-    used = size[:needed] if size.ndim == 1 else np.full(1, np.nan)
+    used = size[:needed] if size.ndim == 1 and len(size) <= 3 else np.full(1, np.nan)
     if len(used) < needed or not np.all(np.isfinite(used) & (used > 0)):
         raise ValueError(
             f"obstacle '{obstacle.name}' ({obstacle.kind}) has size {obstacle.size}; expected "

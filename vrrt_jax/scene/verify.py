@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vrrt_jax.core.edges import unwrapped
+from vrrt_jax.core.fields import check_loaded
 from vrrt_jax.core.postprocess import CheckedPath
 from vrrt_jax.core.result import Verification
 from vrrt_jax.robots.robot import Robot
@@ -20,6 +21,7 @@ from vrrt_jax.scene.world import World
 
 _LIMIT_TOLERANCE = 1e-5  # [rad] or [m], paths come in float32
 _HALF_TURN_TOLERANCE = 1e-4  # [rad]
+_MOST_STEPS = 10_000_000  # of a path; a robot's own are far shorter
 
 
 def verify_path(
@@ -51,12 +53,18 @@ def verify_path(
             as long.
 
     Raises:
-        ValueError: the path has the wrong shape or is not finite, ``step`` is not positive,
-            ``geometry`` is unknown or missing, or an obstacle is malformed.
+        ValueError: the path has the wrong shape, is not finite or too long, ``step`` is not
+            positive, ``geometry`` is unknown or missing, or an obstacle is malformed.
     """
     path = _checked_path(robot, path)
     if not step > 0:
         raise ValueError(f"step is {step}; expected a positive number [rad], such as 0.005")
+    length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    if length / step > _MOST_STEPS:
+        raise ValueError(
+            f"the path is {length:.3g} rad long, which is {length / step:.3g} steps of {step} rad; "
+            f"expected at most {_MOST_STEPS}: check its units, or raise step"
+        )
     exact = exact_scene(robot, obstacles, geometry=geometry)
     walk = interpolate(robot, path, step)
     # Contacts are asked for up to the first configuration outside the limits.
@@ -160,6 +168,7 @@ def contacts(
 
 
 def _checked_path(robot: Robot, path: np.ndarray) -> np.ndarray:
+    check_loaded(robot, "the robot", "vrrt_jax.load_robot")
     path = np.asarray(path, np.float64)
     if path.ndim != 2 or path.shape[1] != robot.num_joints or len(path) == 0:
         raise ValueError(

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.edges import StraightLineEdges
+from vrrt_jax.core.fields import check_loaded
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import PytreeSubclasses, TraceIgnored, TraceIgnoredNames, pytree, static
 from vrrt_jax.robots.kinematics import Chain
@@ -174,6 +175,7 @@ def build_world(
     """
     if engine not in ENGINES:
         raise ValueError(f"unknown engine '{engine}'; have: {', '.join(ENGINES)}")
+    check_loaded(robot, "the robot", "vrrt_jax.load_robot")
     for obstacle in obstacles:
         check_obstacle(obstacle)
     if not (np.isfinite(margin) and margin >= 0 and np.isfinite(resolution) and resolution > 0):
@@ -327,7 +329,7 @@ def move_obstacle(
     changes = {"position": position, "quaternion": quaternion, "size": size}
     changes = {k: floats(v) for k, v in changes.items() if v is not None}
     if "size" in changes:
-        changes["size"] = (*changes["size"], 0.0, 0.0)[:3]
+        changes["size"] += (0.0,) * (3 - len(changes["size"]))
     return with_obstacles(
         world, [dataclasses.replace(o, **changes) if o.name == name else o for o in obstacles]
     )

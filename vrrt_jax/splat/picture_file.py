@@ -78,7 +78,13 @@ def write_image(path: str | Path, rgb: np.ndarray, alpha: np.ndarray) -> None:
         path: of the file.
         rgb: (H, W, 3) the robot over black, in [0, 1].
         alpha: (H, W) share of each pixel that the robot covers, in [0, 1].
+
+    Raises:
+        ValueError: something is not finite, or alpha is outside of [0, 1].
     """
+    rgb, alpha = np.asarray(rgb), np.asarray(alpha)
+    if not (np.isfinite(rgb).all() and ((alpha >= 0) & (alpha <= 1)).all()):
+        raise ValueError("the picture has colors or an alpha that are not between 0 and 1")
     # Files hold colors that are not multiplied by alpha.
     straight = rgb / np.maximum(alpha, 1e-3)[..., None]
     pixels = np.concatenate([np.clip(straight, 0, 1), alpha[..., None]], axis=-1)
