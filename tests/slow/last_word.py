@@ -221,14 +221,20 @@ def near_configurations(place: Place, num: int, rng: np.random.Generator) -> np.
 
 
 def judge_configurations(place: Place, num: int, seed: int) -> dict[str, Any]:
-    """Counts of configurations that a cover calls free and C MuJoCo does not."""
+    """Counts of configurations that a judge calls free and C MuJoCo does not.
+
+    Judges are the covers, which should miss nothing of the world, and the exact check, which may miss
+    what is stated.
+    """
     q = near_configurations(place, num // 2, np.random.default_rng(seed))
     to_world, to_itself = place.plain.distances(q)
     found: dict[str, Any] = {"configurations": len(q), "colliding": int((to_world < 0).sum())}
-    for engine, cover in place.covers.items():
-        free = cover(q)
-        missed, own = free & (to_world < 0), free & (to_itself < 0)
-        found[engine] = {
+    judges = {**place.covers, "exact": lambda q: np.array([place.exact(one[None]) for one in q])}
+    for judge, is_free in judges.items():
+        free = is_free(q)
+        touches = -STATED if judge == "exact" else 0.0
+        missed, own = free & (to_world < touches), free & (to_itself < touches)
+        found[judge] = {
             "free": int(free.sum()),
             "near": int((free & (to_world < NEAR)).sum()),
             "missed": int(missed.sum()),
@@ -284,7 +290,8 @@ def main() -> int:
         seconds = time.perf_counter() - begin
         shown = {k: v for k, v in paths.items() if k != "examples"}
         print(f"{name} ({seconds:.0f} s): {json.dumps(shown)} {json.dumps(poses)}", flush=True)
-        wrong += paths["missed"] + sum(poses[engine]["missed"] for engine in place.covers)
+        judges = [poses[judge] for judge in (*place.covers, "exact")]
+        wrong += paths["missed"] + sum(judge["missed"] for judge in judges)
         if arguments.json:
             Path(arguments.json).write_text(json.dumps(found, indent=1))
     return int(wrong > 0)
