@@ -223,8 +223,8 @@ def near_configurations(place: Place, num: int, rng: np.random.Generator) -> np.
 def judge_configurations(place: Place, num: int, seed: int) -> dict[str, Any]:
     """Counts of configurations that a judge calls free and C MuJoCo does not.
 
-    Judges are the covers, which should miss nothing of the world, and the exact check, which may miss
-    what is stated.
+    Judges are the covers, which should miss nothing of the world, and the exact check, which may
+    miss what is stated.
     """
     q = near_configurations(place, num // 2, np.random.default_rng(seed))
     to_world, to_itself = place.plain.distances(q)
