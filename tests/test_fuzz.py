@@ -63,6 +63,15 @@ def fields(**changes):
     return lambda file: file.write_text(json.dumps(json.loads(file.read_text()) | changes))
 
 
+def without(name):
+    def spoil(file):
+        kept = json.loads(file.read_text())
+        del kept[name]
+        file.write_text(json.dumps(kept))
+
+    return spoil
+
+
 def pipe(file):
     file.unlink()
     os.mkfifo(file)
@@ -126,6 +135,8 @@ ONCE = [
     ("nrp", "plan/path.json", fields(trajectory=[[1e400] * 8])),
     ("nrp", "curves.json", fields(planners={"rrt": 3})),
     ("nrp", "data/manifest.json", fields(shards={"train_0.npz": 3})),
+    ("nrp", "data/manifest.json", without("shards")),
+    ("vrrt", "dream/_camera_settings.json", text('"width": 480', '"width": Infinity')),
 ]
 
 

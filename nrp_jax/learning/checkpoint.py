@@ -82,7 +82,7 @@ def load_model(path: str | Path) -> Model:
         check_choices(config.task, config.kind, config.scope)
         info = dict(description["info"])
         variables = variables_of(arrays)
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(
             f"'{path}' is not a readable model of this version ({error}); train it again with: nrp "
             "train"

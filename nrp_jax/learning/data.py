@@ -34,6 +34,7 @@ from vrrt_jax.core.files import UNFINISHED, replacing
 from vrrt_jax.core.precision import single_precision
 
 MANIFEST = "manifest.json"
+_FIELDS = ("settings", "rows", "shards")  # of the manifest
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -212,9 +213,11 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
         raise FileNotFoundError(f"no data set in '{folder}': {MANIFEST} is missing; run `nrp data`")
     try:
         manifest = read_json(path)
-        check_fields(manifest, ("settings", "rows", "shards"), "it")
-        record_of(DatasetSettings, manifest.get("settings", {}), "settings")
-        for name, entry in dict(manifest.get("shards", {})).items():
+        check_fields(manifest, _FIELDS, "it")
+        if missing := [name for name in _FIELDS if name not in manifest]:
+            raise ValueError(f"it lacks {', '.join(missing)}")
+        record_of(DatasetSettings, manifest["settings"], "settings")
+        for name, entry in dict(manifest["shards"]).items():
             record_of(Shard, entry, f"the shard '{name}'")
             if Path(name).name != name:
                 raise ValueError(f"the shard '{name}' is not in the folder")

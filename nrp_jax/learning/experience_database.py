@@ -73,7 +73,7 @@ def load_database(path: str | Path, task: str) -> Database:
             raise ValueError("its latents are empty")
         variables = variables_of(arrays)
         found, info = description["task"], dict(description["info"])
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(
             f"'{path}' is not a readable database of this version ({error}); make it again with: "
             f"nrp train --model {FIRE}"

@@ -130,7 +130,7 @@ def load_intrinsics(folder: str | Path) -> tuple[np.ndarray, tuple[int, int]]:
         fx, fy, cx, cy = (float(inner[name]) for name in ("fx", "fy", "cx", "cy"))
         size = camera.get("captured_image_size") or inner["resolution"]
         height, width = int(size["height"]), int(size["width"])
-    except (KeyError, TypeError, IndexError, ValueError) as error:
+    except (KeyError, TypeError, IndexError, ValueError, OverflowError) as error:
         raise ValueError(
             f"'{file}' lacks {error}; expected camera_settings[0] with intrinsic_settings (fx, fy, "
             "cx, cy) and captured_image_size (width, height)"

@@ -121,7 +121,14 @@ def load_self_model(path: str | Path) -> SelfModel:
             seed=header["seed"],
             info=header["info"],
         )
-    except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
+    except (
+        KeyError,
+        TypeError,
+        AttributeError,
+        ValueError,
+        OverflowError,
+        RecursionError,
+    ) as error:
         what = f"it lacks {error}" if isinstance(error, KeyError) else error
         raise ValueError(
             f"'{path}' is not a readable self-model ({what}); train it again with: vrrt fit"
