@@ -9,6 +9,8 @@ from vrrt_jax.core.arrays_file import read_arrays
 from vrrt_jax.core.files import replacing
 from vrrt_jax.core.types import Tree
 
+_LARGEST = 1e9  # [rad] or [m] of a node
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Nodes:
@@ -55,7 +57,7 @@ def load_nodes(path: Path, num_joints: int) -> Nodes:
     q, parent, score = (arrays[name] for name in _FIELDS)
     num = len(q) if q.ndim == 2 and q.shape[1] == num_joints else -1
     is_tree = q.dtype.kind == score.dtype.kind == "f" and parent.dtype.kind == "i"
-    is_tree = is_tree and parent.shape == score.shape == (num,) and np.isfinite(q).all()
+    is_tree = is_tree and parent.shape == score.shape == (num,) and (np.abs(q) <= _LARGEST).all()
     if not is_tree or np.any((parent < -1) | (parent >= num)) or np.isnan(score).any():
         shapes = ", ".join(f"{name} {arrays[name].shape}" for name in _FIELDS)
         raise ValueError(
