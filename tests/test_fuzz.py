@@ -133,7 +133,7 @@ ONCE = [
     ("nrp", "problem/problem.json", fields(map=3)),
     ("nrp", "models/discriminator/model.npz", array("description", lambda _: np.array("{}"))),
     ("nrp", "plan/path.json", fields(trajectory=[[1e400] * 8])),
-    ("nrp", "plan/tree.npz", array("q", lambda a: a * 1e300)),
+    ("nrp", "plan/tree.npz", array("q", lambda a: a.astype(float) * 1e300)),
     ("nrp", "curves.json", fields(planners={"rrt": 3})),
     ("nrp", "data/manifest.json", fields(shards={"train_0.npz": 3})),
     ("nrp", "data/manifest.json", without("shards")),
