@@ -1,5 +1,6 @@
 """Small runs of the commands that take long, in processes of their own, and what they leave."""
 
+import argparse
 import csv
 import dataclasses
 import hashlib
@@ -8,8 +9,9 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -240,3 +242,35 @@ def commands(shared: Path) -> list[Command]:
             result=lambda f: sorted((name, json.dumps(plain(row))) for name, row in _curves(f)),
         ),
     ]
+
+
+def try_all(
+    parser: argparse.ArgumentParser,
+    attempt: Callable[[Command, Path, argparse.Namespace], tuple[str, list[str]]],
+    more: Sequence[Command] = (),
+) -> int:
+    """Try all commands, and print what came of each; returns 1 if anything went wrong.
+
+    Args:
+        parser: of the options of the attempts.
+        attempt: of a command, the folder to work in and the options: what came of it, and what
+            went wrong.
+        more: commands to try first.
+    """
+    parser.add_argument("--only", default="", help="commands whose names hold this")
+    parser.add_argument("--folder", help="where to work; a temporary one by default")
+    arguments = parser.parse_args()
+    failed = 0
+    with tempfile.TemporaryDirectory() as folder:
+        shared = Path(arguments.folder or folder)
+        shared.mkdir(exist_ok=True)
+        for command in [*more, *commands(shared)]:
+            if arguments.only not in command.name:
+                continue
+            try:
+                told, wrong = attempt(command, shared, arguments)
+            except AssertionError as error:
+                told, wrong = "failed", [str(error)]
+            failed += len(wrong)
+            print(f"{command.name}: {told}, wrong {len(wrong)} {wrong}", flush=True)
+    return int(failed > 0)

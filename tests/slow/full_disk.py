@@ -6,10 +6,9 @@ that fill at different moments.
 
 import argparse
 import subprocess
-import tempfile
 from pathlib import Path
 
-from .commands import Command, commands, start, told_file
+from .commands import Command, start, told_file, try_all
 from .kill import fresh, kept, undisturbed
 
 
@@ -18,8 +17,8 @@ def used_kib(folder: Path) -> int:
     return sum(4 * -(-f.stat().st_size // 4096) for f in folder.rglob("*") if f.is_file())
 
 
-def filled(command: Command, shared: Path, shares: list[float]) -> str:
-    """Run a command on disks with a share of the room that it needs: how it ended."""
+def filled(command: Command, shared: Path, shares: list[float]) -> tuple[str, list[str]]:
+    """Run a command on disks with a share of the room it needs: how it ended, what was wrong."""
     undisturbed(command, shared / "whole")
     expected, need = command.result(shared / "whole"), used_kib(shared / "whole")
     wrong, full = [], 0
@@ -47,27 +46,18 @@ def filled(command: Command, shared: Path, shares: list[float]) -> str:
             wrong.append(f"{size} KiB: {error}")
         finally:
             subprocess.run(["umount", "-l", folder], check=True)
-    disks = f"{full} of {len(shares)} disks of {need} KiB and less were full"
-    return f"{disks}, wrong {len(wrong)} {wrong}"
+    return f"{full} of {len(shares)} disks of {need} KiB and less were full", wrong
 
 
 def main() -> int:
     """Fill all disks; ends with 1 if anything went wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--shares", default="0.1,0.3,0.5,0.7,0.9", help="of the room needed")
-    parser.add_argument("--only", default="", help="commands whose names hold this")
-    parser.add_argument("--folder", help="where to work; a temporary one by default")
-    arguments = parser.parse_args()
-    failed = 0
-    with tempfile.TemporaryDirectory() as folder:
-        shared = Path(arguments.folder or folder)
-        shared.mkdir(exist_ok=True)
-        for command in commands(shared):
-            if arguments.only in command.name:
-                words = filled(command, shared, [float(s) for s in arguments.shares.split(",")])
-                failed += "wrong 0" not in words
-                print(f"{command.name}: {words}", flush=True)
-    return int(failed > 0)
+
+    def attempt(command, shared, arguments):
+        return filled(command, shared, [float(share) for share in arguments.shares.split(",")])
+
+    return try_all(parser, attempt)
 
 
 if __name__ == "__main__":

@@ -6,12 +6,11 @@ Run ``python -m tests.slow.interrupt --times 10``.
 import argparse
 import signal
 import subprocess
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from .commands import Command, commands, end, start, told_file
+from .commands import Command, end, start, told_file, try_all
 from .kill import fresh, kept
 
 SOON = 2.0  # [s]
@@ -43,8 +42,8 @@ def others() -> list[Command]:
 
 def interrupted(
     command: Command, shared: Path, times: int, within: float, rng: np.random.Generator
-) -> str:
-    """Interrupt a command at random moments of so many seconds: how it ended."""
+) -> tuple[str, list[str]]:
+    """Interrupt a command at random moments of so many seconds: how it ended, what was wrong."""
     folder, before = fresh(shared / "interrupted"), {}
     slowest, wrong, count = 0.0, [], 0
     for _ in range(3 * times):
@@ -66,7 +65,7 @@ def interrupted(
             continue
         assert run.returncode in (0, 1), told_file(folder).read_text()[-300:]
         folder, before = fresh(shared / "interrupted"), {}
-    return f"{count} interrupts, slowest {slowest:.2f} s, wrong {len(wrong)} {wrong}"
+    return f"{count} interrupts, slowest {slowest:.2f} s", wrong
 
 
 def main() -> int:
@@ -74,22 +73,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--times", type=int, default=10)
     parser.add_argument("--within", type=float, default=30.0, help="of the start [s]")
-    parser.add_argument("--only", default="", help="commands whose names hold this")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--folder", help="where to work; a temporary one by default")
-    arguments = parser.parse_args()
-    failed = 0
-    with tempfile.TemporaryDirectory() as folder:
-        shared = Path(arguments.folder or folder)
-        shared.mkdir(exist_ok=True)
-        for command in [*others(), *commands(shared)]:
-            if arguments.only not in command.name:
-                continue
-            rng = np.random.default_rng(arguments.seed)
-            words = interrupted(command, shared, arguments.times, arguments.within, rng)
-            failed += "wrong 0" not in words
-            print(f"{command.name}: {words}", flush=True)
-    return int(failed > 0)
+
+    def attempt(command, shared, arguments):
+        rng = np.random.default_rng(arguments.seed)
+        return interrupted(command, shared, arguments.times, arguments.within, rng)
+
+    return try_all(parser, attempt, others())
 
 
 if __name__ == "__main__":

@@ -7,14 +7,13 @@ counted twice, and what comes out is what an undisturbed run tells.
 import argparse
 import shutil
 import subprocess
-import tempfile
 import time
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
-from .commands import Command, commands, end, start, told_file
+from .commands import Command, end, start, told_file, try_all
 
 
 def fresh(folder: Path) -> Path:
@@ -78,25 +77,13 @@ def main() -> int:
     """Kill them all; ends with 1 if anything was lost."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=20, help="of each command")
-    parser.add_argument("--only", default="", help="commands whose names hold this")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--folder", help="where to work; a temporary one by default")
-    arguments = parser.parse_args()
-    failed = 0
-    with tempfile.TemporaryDirectory() as folder:
-        shared = Path(arguments.folder or folder)
-        shared.mkdir(exist_ok=True)
-        for command in commands(shared):
-            if arguments.only not in command.name:
-                continue
-            try:
-                told = disturbed(
-                    command, shared, arguments.kills, np.random.default_rng(arguments.seed)
-                )
-            except AssertionError as error:
-                failed, told = failed + 1, f"FAILED: {error}"
-            print(f"{command.name}: {told}", flush=True)
-    return int(failed > 0)
+
+    def attempt(command, shared, arguments):
+        rng = np.random.default_rng(arguments.seed)
+        return disturbed(command, shared, arguments.kills, rng), []
+
+    return try_all(parser, attempt)
 
 
 if __name__ == "__main__":
