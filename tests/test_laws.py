@@ -13,6 +13,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from nrp_jax.learning import local_map
 from nrp_jax.scene import reeds_shepp
 from vrrt_jax.core import tree as trees
 from vrrt_jax.core.edges import StraightLineEdges, nearest_turn, unwrapped
@@ -115,6 +116,58 @@ rewired = jax.jit(
         WORLD, tree, expansion, radius=radius, edge_steps=64, checks=16, tries=2, ancestors=2
     )
 )
+
+
+grown = jax.jit(trees.insert)
+
+
+@many
+@given(seeds, st.integers(0, 12), arrays(bool, 8))
+def test_children_are_appended_in_their_order_as_far_as_there_is_room(seed, size, valid):
+    rng, capacity = np.random.default_rng(seed), 12
+    tree = trees.create(jnp.zeros((1, 3)), jnp.zeros(1), jnp.zeros((1, 2)), capacity)
+    old = rng.normal(size=(capacity, 3)).astype(np.float32)
+    tree = dataclasses.replace(tree, q=jnp.asarray(old), size=jnp.int32(size))
+    children = {
+        "q": rng.normal(size=(8, 3)).astype(np.float32),
+        "parent": rng.integers(0, max(size, 1), 8).astype(np.int32),
+        "cost": rng.uniform(size=8).astype(np.float32),
+        "score": rng.uniform(size=8).astype(np.float32),
+        "payload": rng.normal(size=(8, 2)).astype(np.float32),
+    }
+    after, slot = grown(tree, **children, valid=valid)
+    kept = np.flatnonzero(valid)[: capacity - size]
+    end = size + len(kept)
+    assert int(after.size) == end
+    expected = np.full(8, capacity)
+    expected[kept] = np.arange(size, end)
+    np.testing.assert_array_equal(slot, expected)
+    for name, rows in children.items():
+        np.testing.assert_array_equal(np.asarray(getattr(after, name))[size:end], rows[kept])
+    untouched = np.r_[:size, end:capacity]
+    np.testing.assert_array_equal(np.asarray(after.q)[untouched], old[untouched])
+
+
+seen = jax.jit(local_map.window)
+
+
+@many
+@given(seeds, st.tuples(places, places), st.tuples(places, places))
+def test_windows_hold_the_cells_around_the_base(seed, base, origin):
+    """By a plain look at each cell's place; outside the map all is solid."""
+    half, cell = local_map.SIDE // 2, np.float32(0.1)
+    solid = np.random.default_rng(seed).uniform(size=(30, 25, 2)) < 0.3
+    padded = np.pad(solid, [(half, half), (half, half), (0, 0)], constant_values=True)
+    origin, q = np.float32(origin), np.float32([*np.abs(base), 0.4])
+    q[:2] += origin
+    window = np.asarray(seen(padded, q, cell, origin))
+    middle = np.asarray(local_map.center(q, cell, origin))
+    assert np.abs(middle - q[:2]).max() <= cell / 2 + 1e-5
+    for i, j in np.random.default_rng(seed).integers(0, local_map.SIDE, (40, 2)):
+        place = middle + cell * (np.array([i, j]) - half + 0.5)  # of the middle of the cell
+        x, y = np.floor((place - origin) / cell).astype(int)
+        inside = 0 <= x < 30 and 0 <= y < 25
+        np.testing.assert_array_equal(window[i, j], solid[x, y] if inside else [True, True])
 
 
 @few
