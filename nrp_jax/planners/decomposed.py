@@ -99,7 +99,9 @@ def search_decomposed(
     history = [_sum_of(base_row, *latest, seconds=way.search_s)]
     seconds, compile_s, alive = way.search_s, way.compile_s, [0, 1]
     while alive and seconds < time_limit_s:
-        for index in [*alive]:
+        # What one leg of the arm lacks keeps all three from being a path.
+        lack = [index for index in alive if not np.isfinite(latest[index][COST])]
+        for index in lack or [*alive]:
             leg = legs[index]
             found = search(
                 leg.world,

@@ -12,7 +12,7 @@ import numpy as np
 from nrp_jax.planners.by_drive import search_by_drive
 from nrp_jax.planners.drive import Folded
 from nrp_jax.planners.nrp_connect import NRPConnect
-from nrp_jax.planners.shorten import shorten
+from nrp_jax.planners.shorten import accepted, shorten
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.search import COST, SearchResult, StopReason, Termination
@@ -45,7 +45,7 @@ def search_with_restarts(
         folded: postures of the first searches, which are by drive until a path is kept; None to do
             without.
         accept: whether a path (P, D) may be kept, such as the exact check; None to keep any. A path
-            whose shortcuts are refused is asked for as it was found. If that is refused too, later
+            whose shortcuts are refused is shortened in parts. If that is refused too, later
             searches check twice as finely, at most :data:`MOST_REFINED` times.
         key: random key.
         termination: of all searches together; they go on after the goal is reached.
@@ -81,13 +81,16 @@ def search_with_restarts(
         iterations, seconds = iterations + int(found.tree.iteration), seconds + found.search_s
         nodes, compile_s = nodes + int(found.tree.size), compile_s + found.compile_s
         if raw is not None:
+            own, begun = jax.random.fold_in(key, attempt), time.perf_counter()
+            shorten(finer, raw, key=own, rounds=0)  # compiles, if anything has to
             started = time.perf_counter()
-            short = shorten(finer, raw, key=jax.random.fold_in(key, attempt))
-            for one in (short, raw):
-                length = path_length(finer, one)
-                if length < cost and (accept is None or accept(one)):
-                    best, path, cost = found, one, length
-                    break
+            compile_s += started - begun
+            short = shorten(finer, raw, key=own)
+            if path_length(finer, short) < cost:  # else nothing of it is shorter either
+                if accept is not None:
+                    short = accepted(finer, raw, short, accept, key=own)
+                if short is not None and (length := path_length(finer, short)) < cost:
+                    best, path, cost = found, short, length
             if path is None and refined < MOST_REFINED:
                 world = dataclasses.replace(world, resolution=world.resolution / 2)
                 refined += 1
