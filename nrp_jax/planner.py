@@ -19,7 +19,7 @@ from nrp_jax.planners.decomposed import search_decomposed, shortcut_legs
 from nrp_jax.planners.drive import folded_postures
 from nrp_jax.planners.nrp_connect import NRPConnect, default_planner
 from nrp_jax.planners.restarts import search_with_restarts
-from nrp_jax.planners.shorten import shorten
+from nrp_jax.planners.shorten import shorten, shorten_parts
 from nrp_jax.scene.configurations import check_configuration
 from nrp_jax.scene.exact import ExactScene, verify
 from nrp_jax.scene.nearest import shifted, working_world
@@ -207,8 +207,7 @@ def _searched(
             return search_by_drive(world, goal, policy, tree, **options)
 
         def accept(path: np.ndarray) -> bool:
-            verification = _checked(scene, world, places, path).verification
-            return verification is not None and verification.ok
+            return _is_free_part(scene, world, places, path)
 
         return search_with_restarts(world, goal, policy, tree, accept=accept, **options)
     found = search(world, goal, policy, tree, **options)
@@ -287,6 +286,13 @@ def _checked(scene: ExactScene, world: GridWorld, places: _Places, path: np.ndar
     return CheckedPath(path=path, trajectory=trajectory, verification=verification)
 
 
+def _is_free_part(scene: ExactScene, world: GridWorld, places: _Places, path: np.ndarray) -> bool:
+    """Whether the exact check passes a path (P, D), or a part of one that begins elsewhere."""
+    begins = dataclasses.replace(places, start=places.of(path[0]))
+    verification = _checked(scene, world, begins, path).verification
+    return verification is not None and verification.ok
+
+
 def _finish(
     scene: ExactScene,
     world: GridWorld,
@@ -303,6 +309,11 @@ def _finish(
     if loss <= threshold:
         finer = dataclasses.replace(world, resolution=world.resolution / 2)
         done = postprocess(finer, raw, check, key=key, shorten=shorter)
+        if done.is_verified and done.refused:  # of a raw path some parts may still be shortened
+            accept = functools.partial(_is_free_part, scene, world, places)
+            parts = shorten_parts(finer, done.raw_path, accept, key=key, how=shorter)
+            if parts is not None:  # each of them is accepted
+                done = dataclasses.replace(done, checked=check(parts))
         status = Status.SOLVED if done.is_verified else Status.NOT_VERIFIED
     else:
         done = unchecked(raw, trajectory_of(world, raw))

@@ -12,7 +12,7 @@ import numpy as np
 from nrp_jax.planners.by_drive import search_by_drive
 from nrp_jax.planners.drive import Folded
 from nrp_jax.planners.nrp_connect import NRPConnect
-from nrp_jax.planners.shorten import accepted, shorten
+from nrp_jax.planners.shorten import shorten, shorten_parts
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.search import COST, SearchResult, StopReason, Termination
@@ -87,8 +87,8 @@ def search_with_restarts(
             compile_s += started - begun
             short = shorten(finer, raw, key=own)
             if path_length(finer, short) < cost:  # else nothing of it is shorter either
-                if accept is not None:
-                    short = accepted(finer, raw, short, accept, key=own)
+                if accept is not None and not accept(short):
+                    short = shorten_parts(finer, raw, accept, key=own)
                 if short is not None and (length := path_length(finer, short)) < cost:
                     best, path, cost = found, short, length
             if path is None and refined < MOST_REFINED:

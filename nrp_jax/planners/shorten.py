@@ -22,40 +22,38 @@ def shorten(world: Space, path: np.ndarray, *, key: jax.Array, **options: Any) -
     return prune(world, shortcut(world, prune(world, path), key=key, **options))
 
 
-def accepted(
+def shorten_parts(
     world: Space,
     path: np.ndarray,
-    short: np.ndarray,
     accept: Callable[[np.ndarray], bool],
     *,
     key: jax.Array,
+    how: Callable[..., np.ndarray] = shorten,
     halvings: int = 3,
 ) -> np.ndarray | None:
-    """A shortened path (P', D) if it is accepted; else the path (P, D), shortened in parts.
+    """Shorten the halves of a path (P, D) by themselves, and halves of those that are refused.
 
-    One shortcut that all but touches something would cost the path all others. So halves are
-    shortened by themselves, and halves of those that are refused. What cannot be halved stays.
+    One shortcut that all but touches something would cost the path all others.
 
     Args:
         world: the robot in a home.
-        path: as it was found.
-        short: what :func:`shorten` makes of it.
+        path: whose shortcuts are refused as a whole.
         accept: whether a part of a path may be kept, such as the exact check.
         key: random key.
-        halvings: at most.
+        how: what shortens a part.
+        halvings: at most; what is refused then stays as it is.
 
     Returns:
-        None if a part is refused as it was found.
+        (P', D); None if a part is refused as it is.
     """
-    if accept(short):
-        return short
     if len(path) < 3 or not halvings:
         return path if accept(path) else None
     found, middle = [], len(path) // 2
     for index, part in enumerate((path[: middle + 1], path[middle:])):
         own = jax.random.fold_in(key, index)
-        shorter = shorten(world, part, key=own)
-        one = accepted(world, part, shorter, accept, key=own, halvings=halvings - 1)
+        one = how(world, part, key=own)
+        if not accept(one):
+            one = shorten_parts(world, part, accept, key=own, how=how, halvings=halvings - 1)
         if one is None:
             return None
         found.append(one)

@@ -18,7 +18,7 @@ from nrp_jax.scene.nearest import shifted, working_world
 from nrp_jax.scene.odometry import configurations_along, odometry, poses_along
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.wide_turns import propose
-from nrp_jax.scene.world import batch_is_free, build_world
+from nrp_jax.scene.world import GridWorld, batch_is_free, build_world
 from vrrt_jax.core.check_protocols import overrides_is_free
 from vrrt_jax.core.result import PlanResult, Verification
 from vrrt_jax.core.shortcut import padded
@@ -46,7 +46,7 @@ def quicken(
     path: np.ndarray | PlanResult,
     *,
     key: jax.Array,
-    world: CarWorld | None = None,
+    world: GridWorld | None = None,
     scene: ExactScene | None = None,
     proposals: int = PROPOSALS,
 ) -> QuickPath:
