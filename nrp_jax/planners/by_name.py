@@ -19,15 +19,16 @@ from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.planners import RRT, BITStar, InformedRRTStar, RRTConnect, RRTStar
 from vrrt_jax.core.types import ExpansionPolicy
 
-CONNECT = ("nrp-connect", "nrp-star-connect")
+RESTARTS, QUICK = "nrp-star-connect", "nrp-star-quick"
+CONNECT = ("nrp-connect", RESTARTS, QUICK)
 DECOMPOSED = "decomposed"
 # Those of the last two rows go on to improve their paths until the budget ends.
 PLANNERS = (
     *("rrt", "rrt-is", "rrt-connect", "cvae-rrt", "fire", "nrp-d", "nrp-g", "nrp-connect"),
     *("rrt-star", "irrt-star", "bit-star", "cvae-irrt-star", "next"),
-    *("nrp-star-d", "nrp-star-g", "nrp-star-connect", "fire-star", DECOMPOSED),
+    *("nrp-star-d", "nrp-star-g", RESTARTS, QUICK, "fire-star", DECOMPOSED),
 )
-FETCH_ONLY = ("fire", "fire-star", DECOMPOSED)  # the paper has them for the Fetch alone
+FETCH_ONLY = ("fire", "fire-star", QUICK, DECOMPOSED)  # of a base that drives
 # Of the samplers that planners need.
 KINDS = {
     "cvae-rrt": GLOBAL_CVAE,

@@ -30,6 +30,7 @@ def search_with_restarts(
     *,
     folded: Folded | None = None,
     accept: Callable[[np.ndarray], bool] | None = None,
+    measure: Callable[[np.ndarray], float] | None = None,
     key: jax.Array,
     termination: Termination,
     time_limit_s: float,
@@ -47,6 +48,8 @@ def search_with_restarts(
         accept: whether a path (P, D) may be kept, such as the exact check; None to keep any. A path
             whose shortcuts are refused is shortened in parts. If that is refused too, later
             searches check twice as finely, at most :data:`MOST_REFINED` times.
+        measure: what the path that is kept has least of, such as the time that it takes; None for
+            its length. With it, every second search is by drive.
         key: random key.
         termination: of all searches together; they go on after the goal is reached.
         time_limit_s: wall time of searches and shortcuts without compilation [s].
@@ -54,10 +57,10 @@ def search_with_restarts(
 
     Returns:
         What was found, with the tree of the shortest path, and that path (P, D); None if no search
-        found one. The history has the length of the shortest path so far, with its shortcuts.
+        found one. The history has the length of the path that is kept, with its shortcuts.
     """
     finer = dataclasses.replace(world, resolution=world.resolution / 2)
-    best, path, cost, refined = None, None, np.inf, 0
+    best, path, cost, least, refined = None, None, np.inf, np.inf, 0
     iterations, nodes, seconds, compile_s = 0, 0, 0.0, 0.0
     history = np.zeros((0, 6))
     for attempt in itertools.count():
@@ -67,7 +70,7 @@ def search_with_restarts(
             goal,
             policy,
             tree,
-            folded=folded if path is None else None,
+            folded=folded if path is None or (measure and attempt % 2) else None,
             key=jax.random.fold_in(key, attempt),
             termination=dataclasses.replace(termination, max_iterations=left),
             time_limit_s=time_limit_s - seconds,
@@ -86,11 +89,14 @@ def search_with_restarts(
             started = time.perf_counter()
             compile_s += started - begun
             short = shorten(finer, raw, key=own)
-            if path_length(finer, short) < cost:  # else nothing of it is shorter either
+            if measure or path_length(finer, short) < cost:  # else nothing of it is shorter either
                 if accept is not None and not accept(short):
                     short = shorten_parts(finer, raw, accept, key=own)
-                if short is not None and (length := path_length(finer, short)) < cost:
-                    best, path, cost = found, short, length
+            if short is not None:
+                length = path_length(finer, short)
+                amount = measure(short) if measure else length
+                if amount < least:
+                    best, path, cost, least = found, short, length, amount
             if path is None and refined < MOST_REFINED:
                 world = dataclasses.replace(world, resolution=world.resolution / 2)
                 refined += 1

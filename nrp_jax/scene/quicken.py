@@ -24,6 +24,7 @@ from vrrt_jax.core.result import PlanResult, Verification
 from vrrt_jax.core.shortcut import padded
 
 PROPOSALS = 20_000
+FEW_PROPOSALS = 3000  # to compare paths by
 PATIENCE = 5000  # it ends after so many proposals in a row that hardly pay
 _GAIN_S = 0.02  # smallest gain worth a change
 _PAYS = 2e-3  # share of the time; changes that gain less count as idle
