@@ -112,7 +112,8 @@ def policy_of(
         return BITStar(lanes=config.lanes, edge_steps=EDGE_STEPS)
     if planner in ("rrt-star", "irrt-star", DECOMPOSED):
         make = RRTStar if planner == "rrt-star" else InformedRRTStar
-        return make(goal_bias=bias, **shape, **REWIRING)
+        early = planner != DECOMPOSED  # whose three legs all lack a path until the last has one
+        return make(goal_bias=bias, rewires_early=early, **shape, **REWIRING)
     # The others have learned samplers.
     if sampler is None:
         packaged = planner in CONNECT
