@@ -7,6 +7,7 @@ from nrp_jax.homes.grid import Grid, load_map
 from nrp_jax.planner import plan
 from nrp_jax.samplers import load_sampler
 from nrp_jax.scene.nearest import nearest_free
+from nrp_jax.scene.quicken import QuickPath, quicken
 from nrp_jax.scene.robots import MobileRobot, link_features, load_robot
 from nrp_jax.scene.world import GridWorld, batch_is_free, build_world, is_free, with_grid
 from nrp_jax.viewer import view
@@ -20,6 +21,7 @@ __all__ = [
     "MobileRobot",
     "PlanResult",
     "PlannerConfig",
+    "QuickPath",
     "Status",
     "Verification",
     "batch_is_free",
@@ -32,6 +34,7 @@ __all__ = [
     "nearest_free",
     "plan",
     "plan_batch",
+    "quicken",
     "view",
     "with_grid",
 ]

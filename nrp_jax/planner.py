@@ -14,15 +14,16 @@ from nrp_jax.config import PlannerConfig
 from nrp_jax.homes.grid import Grid
 from nrp_jax.homes.top_view import TopView
 from nrp_jax.planners.by_drive import search_by_drive
-from nrp_jax.planners.by_name import DECOMPOSED, PLANNERS, policy_of
+from nrp_jax.planners.by_name import DECOMPOSED, PLANNERS, QUICK, RESTARTS, policy_of
 from nrp_jax.planners.decomposed import search_decomposed, shortcut_legs
 from nrp_jax.planners.drive import folded_postures
 from nrp_jax.planners.nrp_connect import NRPConnect, default_planner
 from nrp_jax.planners.restarts import search_with_restarts
-from nrp_jax.planners.shorten import shorten
+from nrp_jax.planners.shorten import shorten, shorten_parts
 from nrp_jax.scene.configurations import check_configuration
 from nrp_jax.scene.exact import ExactScene, verify
 from nrp_jax.scene.nearest import shifted, working_world
+from nrp_jax.scene.quicken import FEW_PROPOSALS, quicken
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.trajectory import trajectory_of, with_waypoints
 from nrp_jax.scene.world import GridWorld, build_world
@@ -108,8 +109,8 @@ def plan(
     goal = q_goal if isinstance(q_goal, ConfigurationGoal) else ConfigurationGoal(q=q_goal)
     q_start, q_goal = check_inputs(robot, world, q_start, goal.q)
     # All that follows is in the planners' own world.
-    world, corner = working_world(world, goal)
-    places = _Places(grid=grid, corner=corner, start=q_start)
+    of_map, (world, corner) = world, working_world(world, goal)
+    places = _Places(grid=grid, world=of_map, corner=corner, start=q_start)
     start, goal_q = (jnp.asarray(shifted(q, -corner), jnp.float32) for q in (q_start, q_goal))
     goal = dataclasses.replace(goal, q=goal_q)
     policy = policy_of(planner, robot, world, sampler, config, (start, goal_q))
@@ -203,13 +204,21 @@ def _searched(
         return search_decomposed(world, goal, policy, tree, grid=places.local_grid(), **options)
     if isinstance(policy, NRPConnect):
         options["folded"] = folded_postures(robot.name)
-        if planner != "nrp-star-connect":
+        if planner not in (RESTARTS, QUICK):
             return search_by_drive(world, goal, policy, tree, **options)
 
         def accept(path: np.ndarray) -> bool:
-            verification = _checked(scene, world, places, path).verification
-            return verification is not None and verification.ok
+            return _is_free_part(scene, world, places, path)
 
+        def seconds(path: np.ndarray) -> float:
+            key, path = jax.random.key(0), places.of_path(path)
+            known = {"world": places.world, "scene": scene, "proposals": FEW_PROPOSALS}
+            try:
+                return quicken(robot, places.grid, path, key=key, **known).duration_s
+            except ValueError:  # it touches something where other steps along it did not
+                return np.inf
+
+        options["measure"] = seconds if planner == QUICK else None
         return search_with_restarts(world, goal, policy, tree, accept=accept, **options)
     found = search(world, goal, policy, tree, **options)
     return found, policy.extract_path(found.tree)
@@ -220,6 +229,7 @@ class _Places:
     """The way back from the planners' own world to the map."""
 
     grid: Grid  # the map
+    world: GridWorld  # of the map
     corner: np.ndarray  # (2,) of the map [m]
     start: np.ndarray  # (D,) as it was given
 
@@ -287,6 +297,13 @@ def _checked(scene: ExactScene, world: GridWorld, places: _Places, path: np.ndar
     return CheckedPath(path=path, trajectory=trajectory, verification=verification)
 
 
+def _is_free_part(scene: ExactScene, world: GridWorld, places: _Places, path: np.ndarray) -> bool:
+    """Whether the exact check passes a path (P, D), or a part of one that begins elsewhere."""
+    begins = dataclasses.replace(places, start=places.of(path[0]))
+    verification = _checked(scene, world, begins, path).verification
+    return verification is not None and verification.ok
+
+
 def _finish(
     scene: ExactScene,
     world: GridWorld,
@@ -303,6 +320,11 @@ def _finish(
     if loss <= threshold:
         finer = dataclasses.replace(world, resolution=world.resolution / 2)
         done = postprocess(finer, raw, check, key=key, shorten=shorter)
+        if done.is_verified and done.refused:  # of a raw path some parts may still be shortened
+            accept = functools.partial(_is_free_part, scene, world, places)
+            parts = shorten_parts(finer, done.raw_path, accept, key=key, how=shorter)
+            if parts is not None:  # each of them is accepted
+                done = dataclasses.replace(done, checked=check(parts))
         status = Status.SOLVED if done.is_verified else Status.NOT_VERIFIED
     else:
         done = unchecked(raw, trajectory_of(world, raw))

@@ -48,7 +48,7 @@ class CurveBenchmark:
         return plain(
             {
                 "format": FORMAT,
-                "what": "curves",
+                "what": "execution" if self.setting.quickened else "curves",
                 **{name: getattr(self.setting, name) for name in numbers},
                 "jobs": self.jobs,
                 "homes": {home.name: home.fingerprint() for home in homes},

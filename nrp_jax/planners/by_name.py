@@ -19,15 +19,16 @@ from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.planners import RRT, BITStar, InformedRRTStar, RRTConnect, RRTStar
 from vrrt_jax.core.types import ExpansionPolicy
 
-CONNECT = ("nrp-connect", "nrp-star-connect")
+RESTARTS, QUICK = "nrp-star-connect", "nrp-star-quick"
+CONNECT = ("nrp-connect", RESTARTS, QUICK)
 DECOMPOSED = "decomposed"
 # Those of the last two rows go on to improve their paths until the budget ends.
 PLANNERS = (
     *("rrt", "rrt-is", "rrt-connect", "cvae-rrt", "fire", "nrp-d", "nrp-g", "nrp-connect"),
     *("rrt-star", "irrt-star", "bit-star", "cvae-irrt-star", "next"),
-    *("nrp-star-d", "nrp-star-g", "nrp-star-connect", "fire-star", DECOMPOSED),
+    *("nrp-star-d", "nrp-star-g", RESTARTS, QUICK, "fire-star", DECOMPOSED),
 )
-FETCH_ONLY = ("fire", "fire-star", DECOMPOSED)  # the paper has them for the Fetch alone
+FETCH_ONLY = ("fire", "fire-star", QUICK, DECOMPOSED)  # of a base that drives
 # Of the samplers that planners need.
 KINDS = {
     "cvae-rrt": GLOBAL_CVAE,
@@ -111,7 +112,8 @@ def policy_of(
         return BITStar(lanes=config.lanes, edge_steps=EDGE_STEPS)
     if planner in ("rrt-star", "irrt-star", DECOMPOSED):
         make = RRTStar if planner == "rrt-star" else InformedRRTStar
-        return make(goal_bias=bias, **shape, **REWIRING)
+        early = planner != DECOMPOSED  # whose three legs all lack a path until the last has one
+        return make(goal_bias=bias, rewires_early=early, **shape, **REWIRING)
     # The others have learned samplers.
     if sampler is None:
         packaged = planner in CONNECT

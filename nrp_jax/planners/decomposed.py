@@ -99,15 +99,19 @@ def search_decomposed(
     history = [_sum_of(base_row, *latest, seconds=way.search_s)]
     seconds, compile_s, alive = way.search_s, way.compile_s, [0, 1]
     while alive and seconds < time_limit_s:
-        for index in [*alive]:
+        # What one leg of the arm lacks keeps all three from being a path: it goes first, and no
+        # farther than to a path.
+        lack = [index for index in alive if not np.isfinite(latest[index][COST])]
+        for index in lack or [*alive]:
             leg = legs[index]
+            enough = leg.goal.threshold if lack else half.score
             found = search(
                 leg.world,
                 leg.goal,
                 policy,
                 leg.found.tree,
                 key=jax.random.fold_in(key, index),
-                termination=half,
+                termination=dataclasses.replace(half, score=np.float32(enough)),
                 time_limit_s=min(TURN_S, time_limit_s - seconds),
                 **options,
             )
@@ -116,7 +120,8 @@ def search_decomposed(
                 history.append(_sum_of(base_row, *latest, seconds=seconds + row[1]))
             legs[index] = dataclasses.replace(leg, found=found)
             seconds, compile_s = seconds + found.search_s, compile_s + found.compile_s
-            if found.stopped is not StopReason.TIME_LIMIT:
+            has_first = bool(lack) and found.stopped is StopReason.REACHED
+            if found.stopped is not StopReason.TIME_LIMIT and not has_first:
                 alive.remove(index)
             if found.stopped is StopReason.INTERRUPTED:
                 alive = []

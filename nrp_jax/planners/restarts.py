@@ -12,7 +12,7 @@ import numpy as np
 from nrp_jax.planners.by_drive import search_by_drive
 from nrp_jax.planners.drive import Folded
 from nrp_jax.planners.nrp_connect import NRPConnect
-from nrp_jax.planners.shorten import shorten
+from nrp_jax.planners.shorten import shorten, shorten_parts
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.goal import ConfigurationGoal
 from vrrt_jax.core.search import COST, SearchResult, StopReason, Termination
@@ -30,6 +30,7 @@ def search_with_restarts(
     *,
     folded: Folded | None = None,
     accept: Callable[[np.ndarray], bool] | None = None,
+    measure: Callable[[np.ndarray], float] | None = None,
     key: jax.Array,
     termination: Termination,
     time_limit_s: float,
@@ -45,8 +46,10 @@ def search_with_restarts(
         folded: postures of the first searches, which are by drive until a path is kept; None to do
             without.
         accept: whether a path (P, D) may be kept, such as the exact check; None to keep any. A path
-            whose shortcuts are refused is asked for as it was found. If that is refused too, later
+            whose shortcuts are refused is shortened in parts. If that is refused too, later
             searches check twice as finely, at most :data:`MOST_REFINED` times.
+        measure: what the path that is kept has least of, such as the time that it takes; None for
+            its length. With it, every second search is by drive.
         key: random key.
         termination: of all searches together; they go on after the goal is reached.
         time_limit_s: wall time of searches and shortcuts without compilation [s].
@@ -54,10 +57,10 @@ def search_with_restarts(
 
     Returns:
         What was found, with the tree of the shortest path, and that path (P, D); None if no search
-        found one. The history has the length of the shortest path so far, with its shortcuts.
+        found one. The history has the length of the path that is kept, with its shortcuts.
     """
     finer = dataclasses.replace(world, resolution=world.resolution / 2)
-    best, path, cost, refined = None, None, np.inf, 0
+    best, path, cost, least, refined = None, None, np.inf, np.inf, 0
     iterations, nodes, seconds, compile_s = 0, 0, 0.0, 0.0
     history = np.zeros((0, 6))
     for attempt in itertools.count():
@@ -67,7 +70,7 @@ def search_with_restarts(
             goal,
             policy,
             tree,
-            folded=folded if path is None else None,
+            folded=folded if path is None or (measure and attempt % 2) else None,
             key=jax.random.fold_in(key, attempt),
             termination=dataclasses.replace(termination, max_iterations=left),
             time_limit_s=time_limit_s - seconds,
@@ -81,13 +84,19 @@ def search_with_restarts(
         iterations, seconds = iterations + int(found.tree.iteration), seconds + found.search_s
         nodes, compile_s = nodes + int(found.tree.size), compile_s + found.compile_s
         if raw is not None:
+            own, begun = jax.random.fold_in(key, attempt), time.perf_counter()
+            shorten(finer, raw, key=own, rounds=0)  # compiles, if anything has to
             started = time.perf_counter()
-            short = shorten(finer, raw, key=jax.random.fold_in(key, attempt))
-            for one in (short, raw):
-                length = path_length(finer, one)
-                if length < cost and (accept is None or accept(one)):
-                    best, path, cost = found, one, length
-                    break
+            compile_s += started - begun
+            short = shorten(finer, raw, key=own)
+            if measure or path_length(finer, short) < cost:  # else nothing of it is shorter either
+                if accept is not None and not accept(short):
+                    short = shorten_parts(finer, raw, accept, key=own)
+            if short is not None:
+                length = path_length(finer, short)
+                amount = measure(short) if measure else length
+                if amount < least:
+                    best, path, cost, least = found, short, length, amount
             if path is None and refined < MOST_REFINED:
                 world = dataclasses.replace(world, resolution=world.resolution / 2)
                 refined += 1

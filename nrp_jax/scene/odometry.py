@@ -2,7 +2,7 @@
 
 Along a piece of a Reeds-Shepp curve, the distance driven, the heading and the arm change in
 proportion. So a path is straight lines in these numbers, and limits of wheels and motors hold for
-them one by one. Letters: ``P`` waypoints, ``n`` corners, ``D`` joints.
+them one by one. Letters: ``P`` waypoints, ``n`` corners, ``T`` configurations, ``D`` joints.
 """
 
 from typing import Any
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax.scene import reeds_shepp
+from nrp_jax.scene.exact import STEP
 from nrp_jax.scene.grid_world import GridWorld
 from nrp_jax.scene.nearest import shifted, working_world
 from vrrt_jax.core.precision import single_precision
@@ -37,6 +38,34 @@ def odometry(world: GridWorld, path: np.ndarray) -> np.ndarray:
     steps = np.swapaxes(pieces, 0, 1).reshape(-1, pieces.shape[-1]).astype(float)
     start = np.array([0.0, *np.asarray(path[0], float)[2:]])
     return np.concatenate([start[None], start + np.cumsum(steps[np.any(steps != 0, axis=1)], 0)])
+
+
+def poses_along(pose: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Poses (n + 1, 3) of the base: where it begins, and at the end of each step.
+
+    Args:
+        pose: (3,) at the beginning, x, y [m] and heading [rad].
+        steps: (n, 2 or more) distance driven [m] and turn [rad], and what else changes.
+    """
+    drive, turn = steps[:, 0], steps[:, 1]
+    heading = pose[2] + np.append(0.0, np.cumsum(turn))
+    # The chord of an arc points in its middle heading.
+    chord, middle = drive * np.sinc(turn / (2 * np.pi)), heading[:-1] + turn / 2
+    x, y = (np.append(0.0, np.cumsum(chord * f(middle))) for f in (np.cos, np.sin))
+    return np.stack([pose[0] + x, pose[1] + y, heading], axis=1)
+
+
+def configurations_along(q: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Configurations (T, D) along steps, 0.02 m or rad apart at most; undoes :func:`odometry`.
+
+    Args:
+        q: (D,) at the beginning.
+        steps: (n, D - 1) from one corner to the next.
+    """
+    parts = np.maximum(np.ceil(np.abs(steps).max(axis=1) / STEP), 1).astype(int)
+    fine = np.repeat(steps / parts[:, None], parts, axis=0)
+    arm = np.concatenate([q[None, 3:], q[3:] + np.cumsum(fine[:, 2:], axis=0)])
+    return np.concatenate([poses_along(q[:3], fine), arm], axis=1)
 
 
 @jax.jit

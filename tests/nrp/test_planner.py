@@ -20,6 +20,7 @@ from nrp_jax.planner import Status, plan
 from nrp_jax.scene.exact import ExactScene, Verification, verify
 from nrp_jax.scene.trajectory import trajectory_of
 from vrrt_jax.core.planners import RRTStar
+from vrrt_jax.core.search import no_search
 from vrrt_jax.core.shortcut import path_length, shortcut
 from vrrt_jax.core.types import pytree
 
@@ -298,7 +299,7 @@ def test_a_refused_path_is_told(solve, monkeypatch):
     monkeypatch.setattr(planner, "verify", refuse)
     accepted = 2
     result = solve("rrt-connect")
-    assert result.ok and len(seen) == 2
+    assert result.ok and len(seen) > 2  # parts are asked for too
     same_pose(result.path, result.raw_path, atol=1e-5)
     accepted = 0
     result = solve("rrt-connect")
@@ -353,3 +354,30 @@ def test_an_optimal_planner_and_a_goal_of_ones_own(snake, home, scene):
         plan(snake, home, START, near, planner="rrt", method="nrp-d", **run)
     with pytest.raises(ValueError, match="capacity is 20; expected at least 34"):
         plan(snake, home, START, near, capacity=20, **run)
+
+
+def test_restarts_ask_the_exact_check_for_parts_of_paths(solve, monkeypatch):
+    """A part need not begin where the path does."""
+    verdicts = []
+
+    def ask(world, goal, policy, tree, *, accept, **options):
+        path = np.linspace(START, GOAL, 5).astype(np.float32)  # through the wall at x = 2.5
+        verdicts.extend(accept(part) for part in (path[:2], path[3:], path[1:3]))
+        return no_search(policy, goal, tree), None
+
+    monkeypatch.setattr(planner, "search_with_restarts", ask)
+    assert not solve("nrp-star-connect").ok
+    assert verdicts == [True, True, False]
+
+
+def test_a_path_whose_shortcuts_are_refused_is_shortened_in_parts(solve, home_world, monkeypatch):
+    asked = []
+
+    def refuse_the_first(*arguments, **limits):
+        asked.append(verify(*arguments, **limits))
+        return asked[-1] if len(asked) > 1 else Verification(ok=False, checked=1, contact="a wall")
+
+    monkeypatch.setattr(planner, "verify", refuse_the_first)
+    result = solve("rrt-connect")
+    assert result.ok and result.refused == 1 and len(asked) > 3
+    assert result.cost < 0.95 * path_length(home_world, result.raw_path)

@@ -15,7 +15,7 @@ from vrrt_jax.motion.profile import Phase, change_length, largest, straight
 
 DEPTH = 3 / 16  # distance of a blend from its corner, in units of half width times turn
 _CURVATURE, _CURVATURE_RATE = 3 / 4, 3 / 2  # largest, in units of turn / half width (squared)
-_ROOM = 0.4  # of a segment that a blend may take, so that there is room to change speed
+ROOM = 0.4  # of a segment that a blend may take, so that there is room to change speed
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -79,7 +79,7 @@ def widest_blends(waypoints: np.ndarray, tolerance: float) -> BlendedPath:
     """
     path = BlendedPath(waypoints=waypoints, half_width=np.zeros(max(len(waypoints) - 2, 0)))
     turns = np.linalg.norm(path.turns, axis=1)
-    room = _ROOM * np.minimum(path.lengths[:-1], path.lengths[1:])
+    room = ROOM * np.minimum(path.lengths[:-1], path.lengths[1:])
     widest = np.minimum(tolerance / np.maximum(DEPTH * turns, 1e-12), room)
     return dataclasses.replace(path, half_width=widest if tolerance > 0 else path.half_width)
 
@@ -91,10 +91,10 @@ def speed_profile(path: BlendedPath, limits: MotionLimits) -> list[Phase]:
         path: of two waypoints or more.
         limits: an array (D,) each.
     """
-    # Of each segment: velocity, acceleration and jerk along it that no joint's limit forbids.
-    share = np.maximum(np.abs(path.directions), 1e-12)
-    along = np.stack([(limit / share).min(1) for limit in dataclasses.astuple(limits)], axis=1)
-    speeds = _speeds_at_corners(path, limits, along)
+    along = limits_along(path.directions, limits)
+    inner = np.minimum(along[:-1, 0], along[1:, 0])
+    inner = np.minimum(inner, corner_speeds(path.turns, path.half_width, limits))
+    speeds = np.concatenate([[0.0], inner, [0.0]])
     # Straight lines begin and end where blends do.
     widths = np.concatenate([[0.0], path.half_width, [0.0]])
     free = path.lengths - widths[:-1] - widths[1:]
@@ -107,15 +107,18 @@ def speed_profile(path: BlendedPath, limits: MotionLimits) -> list[Phase]:
     return phases
 
 
-def _speeds_at_corners(path: BlendedPath, limits: MotionLimits, along: np.ndarray) -> np.ndarray:
-    """Speeds (P,) at the ends and in the blends, each as if it were alone."""
-    turn = np.maximum(np.abs(path.turns), 1e-12)
-    width = path.half_width[:, None]
+def limits_along(directions: np.ndarray, limits: MotionLimits) -> np.ndarray:
+    """Velocity, acceleration and jerk along segments (n, 3) that no joint's limit forbids."""
+    share = np.maximum(np.abs(directions), 1e-12)
+    return np.stack([(limit / share).min(1) for limit in dataclasses.astuple(limits)], axis=1)
+
+
+def corner_speeds(turns: np.ndarray, half_width: np.ndarray, limits: MotionLimits) -> np.ndarray:
+    """Speeds (n,) in the blends of corners that limits of acceleration and jerk allow."""
+    turn, width = np.maximum(np.abs(turns), 1e-12), half_width[:, None]
     by_acceleration = np.sqrt(limits.acceleration * width / (_CURVATURE * turn)).min(1)
     by_jerk = np.cbrt(limits.jerk * width**2 / (_CURVATURE_RATE * turn)).min(1)
-    by_velocity = np.minimum(along[:-1, 0], along[1:, 0])
-    inner = np.minimum(by_velocity, np.minimum(by_acceleration, by_jerk))
-    return np.concatenate([[0.0], inner, [0.0]])
+    return np.minimum(by_acceleration, by_jerk)
 
 
 def _leave_room_to_change(speeds: np.ndarray, free: np.ndarray, along: np.ndarray) -> None:

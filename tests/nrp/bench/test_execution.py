@@ -5,7 +5,7 @@ import pytest
 
 import nrp_jax
 from nrp_jax.bench.execution import ratios, times
-from nrp_jax.bench.execution_time import BASE_LIMITS, RISE_S, execution_time
+from nrp_jax.scene.execution_time import BASE_LIMITS, RISE_S, execution_time
 
 pytestmark = pytest.mark.light_compilation
 Q = np.array([0.5, 1.0, 0.0, 0.1, 0, 0, 0, 0, 0, 0, 0])

@@ -8,6 +8,7 @@ import pytest
 import nrp_jax
 from nrp_jax.planners.nrp_connect import NRPConnect
 from nrp_jax.planners.restarts import search_with_restarts
+from nrp_jax.planners.shorten import shorten, shorten_parts
 from vrrt_jax.core.search import StopReason, make_termination
 from vrrt_jax.core.shortcut import path_length
 from vrrt_jax.core.types import pytree
@@ -61,19 +62,39 @@ def test_what_is_refused_is_no_path():
     goal = nrp_jax.ConfigurationGoal(q=jnp.asarray(GOAL))
     policy = NRPConnect(sampler=Unasked(), straight_iterations=1000)
     shared = {"termination": make_termination(0.0, max_iterations=24), "time_limit_s": 60.0}
-    tree, asked = policy.init(world, goal, START[None], 4096), []
+    tree = policy.init(world, goal, START[None], 4096)
 
-    def second(path):
-        asked.append(path)
-        return len(asked) == 2
+    def accept(path):  # all but the straight way
+        return len(path) > 2 or not np.array_equal(path[[0, -1]], [START, GOAL])
 
     found, path = search_with_restarts(
-        world, goal, policy, tree, accept=second, key=jax.random.key(0), **shared
+        world, goal, policy, tree, accept=accept, key=jax.random.key(0), **shared
     )
-    np.testing.assert_array_equal(path, asked[1])
+    assert accept(path) and path_length(world, path) < 1.5 * path_length(
+        world, np.stack([START, GOAL])
+    )
     cost = found.history[:, 4]
     np.testing.assert_allclose(cost[np.isfinite(cost)][-1], path_length(world, path), rtol=1e-5)
     found, path = search_with_restarts(
         world, goal, policy, tree, accept=lambda _: False, key=jax.random.key(0), **shared
     )
     assert path is None and not np.isfinite(found.history[:, 4]).any()
+
+
+def test_what_is_refused_is_shortened_in_parts():
+    world = nrp_jax.build_world(
+        nrp_jax.load_robot("snake"), nrp_jax.Grid(occupied=np.zeros((50, 40), bool))
+    )
+    # A detour, and a place in it that a path may not leave out.
+    kept = (START + GOAL) / 2 + np.array([0, 1, *np.zeros(6)], np.float32)
+    path = np.linspace(START, kept, 9), np.linspace(kept, GOAL, 9)[1:]
+    path = np.concatenate(path).astype(np.float32)
+    path[[3, 12], 1] += 0.5
+
+    def accept(part):
+        return not np.array_equal(part[[0, -1]], [START, GOAL])
+
+    assert not accept(shorten(world, path, key=jax.random.key(0)))
+    found = shorten_parts(world, path, accept, key=jax.random.key(0))
+    np.testing.assert_array_equal(found, [START, kept, GOAL])
+    assert shorten_parts(world, path, lambda _: False, key=jax.random.key(0)) is None

@@ -29,6 +29,8 @@ class RRTStar(RRT):
     tries: int = static(default=1)
     ancestors: int = static(default=0)
     shortcuts: int = static(default=0)  # rounds of shortcuts of the best path in an iteration
+    # Rewiring finds no first path, and takes most of an iteration: it may begin once there is one.
+    rewires_early: bool = static(default=True)
 
     @classmethod
     def for_world(cls, world: Space, **settings: Any) -> Self:
@@ -61,17 +63,24 @@ class RRTStar(RRT):
         expansion: Expansion,
     ) -> Tree:
         """Rewire."""
-        return rewire(
-            world,
-            tree,
-            expansion,
-            radius=jnp.float32(self.rewire_radius),
-            edge_steps=self.rewire_steps,
-            checks=self.tries * self.lanes,
-            neighbors=self.neighbors,
-            tries=self.tries,
-            ancestors=self.ancestors,
-        )
+
+        def rewired(tree: Tree) -> Tree:
+            return rewire(
+                world,
+                tree,
+                expansion,
+                radius=jnp.float32(self.rewire_radius),
+                edge_steps=self.rewire_steps,
+                checks=self.tries * self.lanes,
+                neighbors=self.neighbors,
+                tries=self.tries,
+                ancestors=self.ancestors,
+            )
+
+        if self.rewires_early:
+            return rewired(tree)
+        is_path = jnp.isfinite(self.path_cost(tree, goal.threshold))
+        return jax.lax.cond(is_path, rewired, lambda tree: tree, tree)
 
     def after_iteration(
         self, world: Space, goal: ConfigurationGoal, tree: Tree, key: jax.Array

@@ -8,7 +8,14 @@ import numpy as np
 from nrp_jax.scene.grid_world import GridWorld
 from nrp_jax.scene.odometry import odometry
 from nrp_jax.scene.robots import load_robot as load_mobile_robot
-from vrrt_jax.motion.blended import speed_profile, widest_blends
+from vrrt_jax.motion.blended import (
+    DEPTH,
+    ROOM,
+    corner_speeds,
+    limits_along,
+    speed_profile,
+    widest_blends,
+)
 from vrrt_jax.motion.limits import MotionLimits, motion_limits
 from vrrt_jax.motion.trajectory import simplified
 from vrrt_jax.robots.robot import load_robot
@@ -33,7 +40,12 @@ def execution_time(world: GridWorld, path: np.ndarray, tolerance: float = TOLERA
         tolerance: how far a rounded corner may be from the path; with 0 the robot stops at every
             corner and never leaves the path.
     """
-    corners = simplified(odometry(world, path))
+    return time_along(odometry(world, path), tolerance)
+
+
+def time_along(corners: np.ndarray, tolerance: float = TOLERANCE) -> float:
+    """Time from rest to rest along the corners (n, D - 1) of :func:`odometry` [s]."""
+    corners = simplified(corners)
     if len(corners) == 1:
         return 0.0
     blends = widest_blends(corners, tolerance)
@@ -41,12 +53,48 @@ def execution_time(world: GridWorld, path: np.ndarray, tolerance: float = TOLERA
     directions = blends.directions
     turns_back = np.sum(directions[:-1] * directions[1:], axis=1) < 0
     widths = np.where(turns_back, 0.0, blends.half_width)
-    phases = speed_profile(dataclasses.replace(blends, half_width=widths), _limits())
+    phases = speed_profile(dataclasses.replace(blends, half_width=widths), limits())
     return float(sum(duration for duration, _ in phases))
 
 
+def rough_time(steps: np.ndarray) -> float:
+    """About :func:`time_along` steps (n, D - 1) without those of no length [s], far sooner.
+
+    Speeds change within the limits of acceleration; that jerk is limited only adds to the time that
+    a change takes.
+    """
+    bounds = limits()
+    length = np.linalg.norm(steps, axis=1)
+    direction = steps / length[:, None]
+    turn = np.diff(direction, axis=0)
+    bend, near = np.linalg.norm(turn, axis=1), np.minimum(length[:-1], length[1:])
+    turns_back = np.sum(direction[:-1] * direction[1:], axis=1) < 0
+    widest = np.minimum(TOLERANCE / np.maximum(DEPTH * bend, 1e-12), ROOM * near)
+    width = np.where(turns_back, 0.0, widest)
+    most, faster, rise = limits_along(direction, bounds).T
+    inner = np.minimum(corner_speeds(turn, width, bounds), np.minimum(most[:-1], most[1:]))
+    speeds, widths = ([0.0, *numbers.tolist(), 0.0] for numbers in (inner, width))
+    free = length - np.array(widths[:-1]) - widths[1:]
+    # Each straight line has to have room for the change of speed along it.
+    gains = (2 * faster * free).tolist()
+    for k, gain in enumerate(gains):
+        speeds[k + 1] = min(speeds[k + 1], (speeds[k] ** 2 + gain) ** 0.5)
+    for k in range(len(gains) - 1, -1, -1):
+        speeds[k] = min(speeds[k], (speeds[k + 1] ** 2 + gains[k]) ** 0.5)
+    v = np.array(speeds)
+    before, after = v[:-1], v[1:]
+    peak = np.minimum(most, np.sqrt((before**2 + after**2) / 2 + faster * free))
+    change = 2 * peak - before - after
+    left = free - (2 * peak**2 - before**2 - after**2) / (2 * faster)
+    seconds = change / faster + np.maximum(left, 0.0) / peak
+    for part in (peak - before, peak - after):
+        seconds += np.minimum(faster / rise, np.sqrt(np.maximum(part, 0.0) / rise))
+    blended = width > 0
+    return float(seconds.sum() + (2 * width[blended] / v[1:-1][blended]).sum())
+
+
 @functools.cache
-def _limits() -> MotionLimits:
+def limits() -> MotionLimits:
     """Of the distance driven, the heading, and the Fetch's joints."""
     arm, published = load_robot("fetch"), {}
     limits = motion_limits(arm)
