@@ -94,8 +94,10 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
             traceback.print_exc()
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        if not is_command():
-            print(f"{name}: interrupted", file=sys.stderr)
+        if is_command():  # it has been told; threads that still compile would not survive the end
+            sys.stdout.flush()
+            os._exit(EXIT_INTERRUPTED)
+        print(f"{name}: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
 
 

@@ -101,6 +101,7 @@ def ending_soon(name: str) -> Iterator[None]:
         yield
         return
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    sys.unraisablehook = _without_interrupts
     heard, told = os.pipe()
     os.set_blocking(told, False)
     signal.set_wakeup_fd(told, warn_on_full_buffer=False)
@@ -119,6 +120,12 @@ def ending_soon(name: str) -> Iterator[None]:
     except KeyboardInterrupt:
         _tell(name)  # and clean up, while the watch goes on
         raise
+
+
+def _without_interrupts(unraisable: "sys.UnraisableHookArgs") -> None:
+    """Of an interrupt in the middle of cleaning up, which nobody can catch, nothing is told."""
+    if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(unraisable)
 
 
 @contextlib.contextmanager

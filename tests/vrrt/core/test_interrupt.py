@@ -39,6 +39,25 @@ parser = command.Parser(prog="vrrt")
 parser.add_subparsers(dest="command").add_parser("hash").set_defaults(run=run)
 raise SystemExit(command.run(parser, ["hash"]))
 """
+# A command that is hit where an exception is lost: in what Python runs when it forgets something.
+LOSING = """
+import sys, time
+sys.argv[0] = "vrrt"
+from vrrt_jax.core import command
+
+class Slow:
+    def __del__(self):
+        print("working", flush=True)
+        time.sleep(600)
+
+def run(arguments):
+    Slow()
+    time.sleep(600)
+
+parser = command.Parser(prog="vrrt")
+parser.add_subparsers(dest="command").add_parser("forget").set_defaults(run=run)
+raise SystemExit(command.run(parser, ["forget"]))
+"""
 STARTING = "import sys; sys.argv[0] = 'nrp'; print('working', flush=True); import nrp_jax.cli"
 
 
@@ -68,6 +87,11 @@ def interrupt(code, tmp_path, after=0.0):
 def test_a_command_ends_that_hears_of_no_signal(tmp_path):
     code, seconds, told = interrupt(DEAF, tmp_path)
     assert code == 130 and seconds < 10 and told == ["vrrt hash: interrupted"]
+
+
+def test_of_an_interrupt_that_is_lost_nothing_is_told(tmp_path):
+    code, seconds, told = interrupt(LOSING, tmp_path)
+    assert code == 130 and seconds < 10 and told == ["vrrt forget: interrupted"]
 
 
 def test_workers_say_nothing(tmp_path):
