@@ -4,7 +4,7 @@ import argparse
 import contextlib
 import errno
 import math
-import multiprocessing
+import multiprocessing.util
 import os
 import sys
 import tempfile
@@ -94,8 +94,11 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
             traceback.print_exc()
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        if is_command():  # it has been told; threads that still compile would not survive the end
+        if is_command():
+            # It has been told. Threads that still compile would crash where Python takes itself
+            # apart; all that has to be put away is what processes share.
             sys.stdout.flush()
+            multiprocessing.util._exit_function()
             os._exit(EXIT_INTERRUPTED)
         print(f"{name}: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
