@@ -21,6 +21,7 @@ VRRT_ROOMS = (
     ("report", "viz", "viewer", "doctor"),
     ("bench", "robot_commands"),
     ("cli",),
+    ("__main__",),
 )
 NRP_ROOMS = (
     ("config",),
@@ -33,6 +34,7 @@ NRP_ROOMS = (
     ("viz", "viewer"),
     ("bench",),
     ("cli",),
+    ("__main__",),
 )
 FILES = sorted(
     path.relative_to(ROOT).as_posix()
