@@ -20,8 +20,7 @@ VRRT_ROOMS = (
     ("planner", "batch", "pose", "problems", "random_problem"),
     ("report", "viz", "viewer", "doctor"),
     ("bench", "robot_commands"),
-    ("cli",),
-    ("__main__",),
+    ("cli", "__main__"),
 )
 NRP_ROOMS = (
     ("config",),
@@ -33,8 +32,7 @@ NRP_ROOMS = (
     ("planner", "batch", "problems", "online", "online_problems"),
     ("viz", "viewer"),
     ("bench",),
-    ("cli",),
-    ("__main__",),
+    ("cli", "__main__"),
 )
 FILES = sorted(
     path.relative_to(ROOT).as_posix()
