@@ -323,8 +323,9 @@ def _finish(
         if done.is_verified and done.refused:  # of a raw path some parts may still be shortened
             accept = functools.partial(_is_free_part, scene, world, places)
             parts = shorten_parts(finer, done.raw_path, accept, key=key, how=shorter)
-            if parts is not None:  # each of them is accepted
-                done = dataclasses.replace(done, checked=check(parts))
+            together = None if parts is None else dataclasses.replace(done, checked=check(parts))
+            if together is not None and together.is_verified:
+                done = together
         status = Status.SOLVED if done.is_verified else Status.NOT_VERIFIED
     else:
         done = unchecked(raw, trajectory_of(world, raw))

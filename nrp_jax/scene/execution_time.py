@@ -9,9 +9,8 @@ from nrp_jax.scene.grid_world import GridWorld
 from nrp_jax.scene.odometry import odometry
 from nrp_jax.scene.robots import load_robot as load_mobile_robot
 from vrrt_jax.motion.blended import (
-    DEPTH,
-    ROOM,
     corner_speeds,
+    half_widths,
     limits_along,
     speed_profile,
     widest_blends,
@@ -53,7 +52,7 @@ def time_along(corners: np.ndarray, tolerance: float = TOLERANCE) -> float:
     directions = blends.directions
     turns_back = np.sum(directions[:-1] * directions[1:], axis=1) < 0
     widths = np.where(turns_back, 0.0, blends.half_width)
-    phases = speed_profile(dataclasses.replace(blends, half_width=widths), limits())
+    phases = speed_profile(dataclasses.replace(blends, half_width=widths), _limits())
     return float(sum(duration for duration, _ in phases))
 
 
@@ -63,14 +62,12 @@ def rough_time(steps: np.ndarray) -> float:
     Speeds change within the limits of acceleration; that jerk is limited only adds to the time that
     a change takes.
     """
-    bounds = limits()
+    bounds = _limits()
     length = np.linalg.norm(steps, axis=1)
     direction = steps / length[:, None]
     turn = np.diff(direction, axis=0)
-    bend, near = np.linalg.norm(turn, axis=1), np.minimum(length[:-1], length[1:])
     turns_back = np.sum(direction[:-1] * direction[1:], axis=1) < 0
-    widest = np.minimum(TOLERANCE / np.maximum(DEPTH * bend, 1e-12), ROOM * near)
-    width = np.where(turns_back, 0.0, widest)
+    width = np.where(turns_back, 0.0, half_widths(turn, length, TOLERANCE))
     most, faster, rise = limits_along(direction, bounds).T
     inner = np.minimum(corner_speeds(turn, width, bounds), np.minimum(most[:-1], most[1:]))
     speeds, widths = ([0.0, *numbers.tolist(), 0.0] for numbers in (inner, width))
@@ -94,7 +91,7 @@ def rough_time(steps: np.ndarray) -> float:
 
 
 @functools.cache
-def limits() -> MotionLimits:
+def _limits() -> MotionLimits:
     """Of the distance driven, the heading, and the Fetch's joints."""
     arm, published = load_robot("fetch"), {}
     limits = motion_limits(arm)

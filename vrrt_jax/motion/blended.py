@@ -15,7 +15,7 @@ from vrrt_jax.motion.profile import Phase, change_length, largest, straight
 
 DEPTH = 3 / 16  # distance of a blend from its corner, in units of half width times turn
 _CURVATURE, _CURVATURE_RATE = 3 / 4, 3 / 2  # largest, in units of turn / half width (squared)
-ROOM = 0.4  # of a segment that a blend may take, so that there is room to change speed
+_ROOM = 0.4  # of a segment that a blend may take, so that there is room to change speed
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -78,10 +78,16 @@ def widest_blends(waypoints: np.ndarray, tolerance: float) -> BlendedPath:
         tolerance: Euclidean over joints; with 0 the path keeps its corners.
     """
     path = BlendedPath(waypoints=waypoints, half_width=np.zeros(max(len(waypoints) - 2, 0)))
-    turns = np.linalg.norm(path.turns, axis=1)
-    room = ROOM * np.minimum(path.lengths[:-1], path.lengths[1:])
-    widest = np.minimum(tolerance / np.maximum(DEPTH * turns, 1e-12), room)
-    return dataclasses.replace(path, half_width=widest if tolerance > 0 else path.half_width)
+    return dataclasses.replace(
+        path, half_width=half_widths(path.turns, path.lengths, max(tolerance, 0.0))
+    )
+
+
+def half_widths(turns: np.ndarray, lengths: np.ndarray, tolerance: float) -> np.ndarray:
+    """Half widths (n,) of the widest blends of corners; arguments as of :class:`BlendedPath`."""
+    room = _ROOM * np.minimum(lengths[:-1], lengths[1:])
+    depth = DEPTH * np.linalg.norm(turns, axis=1)
+    return np.minimum(tolerance / np.maximum(depth, 1e-12), room)
 
 
 def speed_profile(path: BlendedPath, limits: MotionLimits) -> list[Phase]:
