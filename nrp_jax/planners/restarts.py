@@ -85,7 +85,10 @@ def search_with_restarts(
         nodes, compile_s = nodes + int(found.tree.size), compile_s + found.compile_s
         if raw is not None:
             own, begun = jax.random.fold_in(key, attempt), time.perf_counter()
-            shorten(finer, raw, key=own, rounds=0)  # compiles, if anything has to
+            path_length(finer, shorten(finer, raw, key=own, rounds=0))  # compiles, if need be
+            for ask in (accept, measure) if attempt == 0 else ():
+                if ask is not None:
+                    ask(raw[:2])  # likewise
             started = time.perf_counter()
             compile_s += started - begun
             short = shorten(finer, raw, key=own)

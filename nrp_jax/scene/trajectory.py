@@ -8,6 +8,8 @@ from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.edges import unwrapped
 from vrrt_jax.core.shortcut import padded
 
+BLOCK = 256  # configurations that are computed at once
+
 
 def trajectory_of(world: GridWorld, path: np.ndarray) -> np.ndarray:
     """A path (P, D) in steps (T, D) of 0.02 m or rad at most; angles go on where they wrap."""
@@ -23,12 +25,20 @@ def with_waypoints(world: GridWorld, path: np.ndarray) -> tuple[np.ndarray, np.n
     index = np.repeat(np.arange(len(counts)), counts)
     within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + 1
     fraction = (within / counts[index]).astype(np.float32)
-    room = 1 << int(len(index) - 1).bit_length()  # few sizes, so few compilations
-    padding = (0, room - len(index))
-    q_a, q_b = (np.pad(path[index + k], [padding, (0, 0)], mode="edge") for k in (0, 1))
-    points = _interpolate(world, q_a, q_b, np.pad(fraction, padding))
-    steps = unwrapped(world, np.concatenate([path[:1], np.asarray(points)[: len(index)]]))
+    # Always as many at a time, so that whatever the path's length nothing compiles anew.
+    points = [
+        _interpolate(
+            world, *(_block(rows, begin) for rows in (path[index], path[index + 1], fraction))
+        )
+        for begin in range(0, len(index), BLOCK)
+    ]
+    steps = unwrapped(world, np.concatenate([path[:1], np.concatenate(points)[: len(index)]]))
     return steps, np.concatenate([[0], np.cumsum(counts)])
+
+
+def _block(rows: np.ndarray, begin: int) -> np.ndarray:
+    """So many rows from one on; the last is repeated where there are fewer."""
+    return rows[np.minimum(np.arange(begin, begin + BLOCK), len(rows) - 1)]
 
 
 @jax.jit

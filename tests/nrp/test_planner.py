@@ -17,6 +17,7 @@ from nrp_jax import planner, viz
 from nrp_jax.bench import planning
 from nrp_jax.cli import main
 from nrp_jax.planner import Status, plan
+from nrp_jax.scene import trajectory
 from nrp_jax.scene.exact import ExactScene, Verification, verify
 from nrp_jax.scene.trajectory import trajectory_of
 from vrrt_jax.core.planners import RRTStar
@@ -210,9 +211,21 @@ def test_headings_of_a_trajectory_go_on(snake, home):
     assert is_continuous.any()
     ends = np.stack([START, START]).astype(np.float32)
     ends[:, is_continuous] = np.array([[3.0], [-3.0]])
-    trajectory = trajectory_of(world, ends)
-    assert np.abs(np.diff(trajectory, axis=0)).max() <= 0.02 + 1e-5
-    np.testing.assert_allclose(trajectory[-1, is_continuous], 2 * np.pi - 3.0, atol=1e-5)
+    steps = trajectory_of(world, ends)
+    assert np.abs(np.diff(steps, axis=0)).max() <= 0.02 + 1e-5
+    np.testing.assert_allclose(steps[-1, is_continuous], 2 * np.pi - 3.0, atol=1e-5)
+
+
+def test_a_trajectory_of_any_length_compiles_nothing_anew(snake, home):
+    world = nrp_jax.build_world(snake, home)
+    ends = np.stack([START, GOAL]).astype(np.float32)
+    short = trajectory_of(world, ends[:1] + [[0.0], [0.03]] * np.eye(8)[0])
+    before = trajectory._interpolate._cache_size()
+    far = trajectory_of(world, ends[[0, 1, 0, 1, 0]])
+    assert len(short) < trajectory.BLOCK < len(far)
+    assert trajectory._interpolate._cache_size() == before
+    assert np.abs(np.diff(far, axis=0)).max() <= 0.02 + 1e-5
+    np.testing.assert_allclose(far[[0, -1]], ends[[0, 0]], atol=1e-5)
 
 
 def test_verification_sees_what_is_wrong(snake, home, scene, solve):

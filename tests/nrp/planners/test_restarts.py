@@ -1,5 +1,7 @@
 """Restarts keep the shortest path that any of the searches has found."""
 
+import time
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,6 +55,34 @@ def test_the_shortest_path_is_kept_until_the_budget_ends():
     np.testing.assert_array_equal(path[[0, -1]], [START, GOAL])
     assert path_length(world, path) == pytest.approx(cost[-1], rel=1e-5)
     assert found.stopped in (StopReason.REACHED, StopReason.ITERATIONS)
+
+
+def test_what_compiles_at_first_takes_none_of_the_budget():
+    world = nrp_jax.build_world(
+        nrp_jax.load_robot("snake"), nrp_jax.Grid(occupied=np.zeros((50, 40), bool))
+    )
+    goal = nrp_jax.ConfigurationGoal(q=jnp.asarray(GOAL))
+    policy = NRPConnect(sampler=Unasked(), straight_iterations=1000)
+    asked = []
+
+    def accept(path):
+        if not asked:
+            time.sleep(1.0)
+        asked.append(len(path))
+        return True
+
+    found, path = search_with_restarts(
+        world,
+        goal,
+        policy,
+        policy.init(world, goal, START[None], 4096),
+        accept=accept,
+        key=jax.random.key(0),
+        termination=make_termination(0.0, max_iterations=48),
+        time_limit_s=60.0,
+    )
+    assert path is not None and asked[0] == 2
+    assert found.compile_s > 1.0 > found.history[np.isfinite(found.history[:, 4])][0, 1]
 
 
 def test_what_is_refused_is_no_path():
