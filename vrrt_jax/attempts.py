@@ -35,6 +35,7 @@ from vrrt_jax.visual.problem import VisualProblem
 ATTEMPT_KEY = 0x7FFFFFFF  # folded into the key of a later attempt; iterations count from 0
 MORE_EACH = 2  # attempts that do more than the one before
 CONFIRMING = 2  # more attempts where a match is in doubt, or has no path
+DOUBTFUL = 0.5  # of the threshold; a match with a larger loss is in doubt
 ROOT_SAMPLES, ROOT_BATCHES = 4096, 8  # random configurations, of which some are roots
 
 
@@ -57,9 +58,9 @@ def plan_by_loss(
         result = attempt(robot, world, problem, policy, roots, key, config, on_progress)
         for again in range(1, config.budget.attempts):
             rest = time_left(config, result.timing["search_s"])
-            # A match in strange colors is believed if a few more attempts find no better one.
+            # A match in doubt is believed if a few more attempts find no better one.
             few_more = result.status in (Status.NO_PATH, Status.NOT_VERIFIED)
-            few_more |= _has_strange_colors(result)
+            few_more |= _is_in_doubt(result)
             goes_on = result.status is Status.NO_MATCH or (few_more and again <= CONFIRMING)
             if not goes_on or rest.budget.time_limit_s == 0:
                 break
@@ -81,8 +82,10 @@ def plan_by_loss(
     return result
 
 
-def _has_strange_colors(result: PlanResult) -> bool:
-    return result.ok and result.colored_loss > result.match_threshold
+def _is_in_doubt(result: PlanResult) -> bool:
+    """Whether the image fits a match less well, or in stranger colors, than most true poses."""
+    threshold = result.match_threshold
+    return result.ok and (result.loss > DOUBTFUL * threshold or result.colored_loss > threshold)
 
 
 def _is_better(other: PlanResult, result: PlanResult, ambiguity: float) -> bool:
