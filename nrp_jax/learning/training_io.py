@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import errno
 import json
 import logging
 import os
@@ -16,10 +15,11 @@ import numpy as np
 import optax
 import orbax.checkpoint as ocp
 
-from vrrt_jax.core.files import replacing
+from vrrt_jax.core.files import NO_ROOM, UNFINISHED, replacing
 from vrrt_jax.core.types import pytree
 
 SECONDS_BETWEEN = 10.0  # between two checkpoints, at least [s]
+SPARE = 2**18  # of a checkpoint, for what is no array [bytes]
 
 
 @pytree
@@ -75,15 +75,31 @@ class CheckpointStore:
         if not last and time.monotonic() - self._saved < SECONDS_BETWEEN:
             return
         self._saved = time.monotonic()
-        arrays = ocp.args.StandardSave({"state": _plain(state), "best": best})
+        arrays = {"state": _plain(state), "best": best}
+        size = sum(leaf.nbytes for leaf in jax.tree.leaves(arrays)) + SPARE
+        arrays = ocp.args.StandardSave(arrays)
         arguments = ocp.args.Composite(arrays=arrays, history=ocp.args.JsonSave(cast(Any, history)))
-        with _told_if_full(Path(self._manager.directory)):
+        folder = Path(self._manager.directory)
+        with _told_if_full(folder):
+            _check_room(folder.with_name(f"room{UNFINISHED}"), size)
             self._manager.save(len(history), args=arguments)
             self._manager.wait_until_finished()
 
     def close(self) -> None:
         """Finish writing and close the folder."""
         self._manager.close()
+
+
+def _check_room(file: Path, size: int) -> None:
+    """Ask the disk for so many bytes, and give them back.
+
+    Where they run out under way, threads of orbax print pages that nothing can catch.
+    """
+    try:
+        with file.open("wb") as handle:
+            os.posix_fallocate(handle.fileno(), 0, size)
+    finally:
+        file.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -97,9 +113,9 @@ def _told_if_full(folder: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        for number in NO_ROOM:
             if os.strerror(number) in str(error):
-                kept = "the epoch before is kept, and the same command goes on with it"
+                kept = "an epoch before is kept, if there is one, and the same command goes on"
                 raise OSError(number, f"{os.strerror(number)}; {kept}", str(folder)) from None
         raise
     finally:

@@ -5,6 +5,7 @@ had not finished when it died is done again by another, and nothing is counted t
 """
 
 import fcntl
+import itertools
 import os
 import socket
 import tempfile
@@ -18,12 +19,15 @@ from vrrt_jax.core.timing import versions
 
 LOCAL = "local"  # the address that stands for this machine alone, also for Ray
 TRIES = 4  # of an item whose worker dies
+SECONDS = 5.0  # between two looks whether machines have come [s]
 
 _core: list[Any] = []  # of this worker: its lock
 
 
 def on_cluster(function: Callable[[Any], Any], items: Sequence[Any], address: str) -> Iterator[Any]:
     """What the function returns for the items, as they come; each item has a core of its own.
+
+    After a failure no item is sent; those that were sent are finished before it is raised.
 
     Args:
         function: it is sent to the cluster once.
@@ -42,10 +46,24 @@ def on_cluster(function: Callable[[Any], Any], items: Sequence[Any], address: st
         shared, here = ray.put(function), versions()
         call = ray.remote(num_cpus=1, max_retries=TRIES - 1)(_call)
         cache = jax.config.jax_compilation_cache_dir
-        pending = [call.remote(shared, item, here, cache) for item in items]
-        while pending:
-            (finished,), pending = ray.wait(pending)
-            yield _result(ray, finished)
+        waiting, pending, failure = iter(items), [], None
+        while True:
+            # As many as there are cores now, and a few that wait for those that come.
+            room = 0 if failure else 2 + int(ray.cluster_resources().get("CPU", 0)) - len(pending)
+            more = itertools.islice(waiting, max(room, 0))
+            pending += [call.remote(shared, item, here, cache) for item in more]
+            if not pending:
+                break
+            finished, pending = ray.wait(pending, timeout=SECONDS)
+            for one in finished:
+                try:
+                    result = _result(ray, one)
+                except Exception as problem:
+                    failure = failure or problem
+                else:
+                    yield result
+        if failure:
+            raise failure
     finally:
         ray.shutdown()
 

@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import errno
 import math
 import multiprocessing.util
 import os
@@ -14,13 +13,13 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from vrrt_jax.core.files import NO_ROOM
 from vrrt_jax.core.interrupt import EXIT_INTERRUPTED, ending_soon, is_command
 
 EXIT_SOLVED, EXIT_UNSOLVED, EXIT_BAD_INPUT = 0, 1, 2
 EXIT_UNREAD = 141  # as a shell says of what a closed pipe ends
 LARGEST = 1e9  # of numbers in lists
 _LONGEST = 600  # characters of a message
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # Those whose messages are for users. Others are named, with what to do.
 KNOWN_ERRORS = (ValueError, OSError, RuntimeError, ModuleNotFoundError)
 
@@ -112,7 +111,7 @@ def in_one_line(error: Exception) -> str:
             f"out of memory ({text or 'no more is to be had'}); close other programs, or ask for "
             "less: smaller files, fewer nodes, images or processes"
         )
-    if isinstance(error, OSError) and error.errno in _NO_ROOM:
+    if isinstance(error, OSError) and error.errno in NO_ROOM:
         return f"{text}; make room on that disk, or choose another place"
     if isinstance(error, OSError) and error.errno is not None:
         return f"{text}; check that path and its permissions"

@@ -1,11 +1,13 @@
 """Files that are there whole or not at all."""
 
 import contextlib
+import errno
 import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # on a disk
 UNFINISHED = ".part"  # how the names of files end while they are written
 
 
@@ -22,6 +24,11 @@ def replacing(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
         with open(part, mode, newline=None if "b" in mode else "") as file:
             yield file
         part.replace(path)
+    except OSError as error:
+        # What runs out of room while it writes does not say where.
+        if error.errno in NO_ROOM and error.filename is None:
+            error.filename = str(path)
+        raise
     finally:
         part.unlink(missing_ok=True)
 

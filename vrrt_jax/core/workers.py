@@ -23,8 +23,7 @@ def in_workers(
 ) -> Iterator[Any]:
     """What the function returns for the items; with one job in their order, otherwise as they come.
 
-    After a failure no item is begun. Processes finish those under way before it is raised; what a
-    cluster has under way is dropped.
+    After a failure no item is begun; those under way are finished before it is raised.
 
     Args:
         function: it is sent to each worker process once, so that it may hold what is large.

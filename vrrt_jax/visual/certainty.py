@@ -1,7 +1,7 @@
 """How sure it is that a match is the right pose: a logistic regression on what polishing found.
 
 Its weights were fitted to plans of the packaged robots at tasks, and in lights, of their own; see
-``docs/benchmarks.md``.
+``docs/arms_results.md``.
 """
 
 import dataclasses

@@ -9,6 +9,8 @@ import numpy as np
 import optax
 import pytest
 
+from nrp_jax.learning.checkpoint import Model, save_model
+from nrp_jax.learning.models import ModelConfig
 from nrp_jax.learning.training_io import CheckpointStore, State
 from vrrt_jax.core import command
 from vrrt_jax.core.results_file import append_row, resume, resume_rows, write
@@ -58,6 +60,15 @@ def test_results_are_replaced_or_kept(tmp_path):
     assert resume(file, HEADER, {}) == HEADER and list(tmp_path.iterdir()) == [file]
 
 
+def test_a_model_that_has_no_room_says_where(tmp_path):
+    config = ModelConfig.default("snake", "discriminator")
+    variables = {"params": {"kernel": np.random.default_rng(0).normal(size=4000)}}
+    model = Model(config=config, variables=variables, info={})
+    with files_of_at_most(1000), pytest.raises(OSError) as raised:
+        save_model(model, tmp_path / "model.npz")
+    assert str(tmp_path / "model.npz") in told(raised) and not list(tmp_path.iterdir())
+
+
 def test_an_epoch_before_is_kept(tmp_path, capfd):
     variables = {"params": {"kernel": np.arange(40_000, dtype=np.float32)}}
 
@@ -69,7 +80,7 @@ def test_an_epoch_before_is_kept(tmp_path, capfd):
     store.save(state(1), variables, [{"loss": 1.0}], last=True)
     with files_of_at_most(20_000), pytest.raises(OSError) as raised:
         store.save(state(2), variables, [{"loss": 1.0}, {"loss": 2.0}], last=True)
-    assert "the epoch before is kept" in told(raised)
+    assert "an epoch before is kept" in told(raised)
     assert "Traceback" not in capfd.readouterr().err
     found, _, history = CheckpointStore(tmp_path / "checkpoint").restore(state(0))
     assert int(jax.device_get(found.step)) == 1 and history == [{"loss": 1.0}]

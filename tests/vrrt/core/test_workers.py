@@ -72,6 +72,17 @@ def test_workers_of_a_cluster_come_and_go(cluster, tmp_path):
     assert sum(times.values()) <= len(ITEMS) + 2 and times[killed] >= 2
 
 
+def test_what_a_cluster_has_under_way_at_a_failure_is_kept(cluster, tmp_path):
+    log, done = tmp_path / "log", []
+    with pytest.raises(ValueError, match="^item 99 makes no sense$"):
+        work = partial(_work, str(log))
+        for result in in_workers(work, [1, 99, *range(20, 60)], 1, cluster.address):
+            done.append(result)
+    begun = {item for item, _ in _begun(log)}
+    assert sorted(done) == sorted(item * item for item in begun - {99})
+    assert 99 in begun and len(done) < 20
+
+
 def test_what_goes_wrong_on_a_cluster_is_told_as_here(cluster, tmp_path):
     with pytest.raises(ValueError, match="^item 99 makes no sense$"):
         list(in_workers(partial(_work, str(tmp_path / "log")), [99], 1, cluster.address))
