@@ -20,8 +20,10 @@ from nrp_jax.bench.curve_rows import ROADMAP, Item, Setting, run_item
 from nrp_jax.bench.curve_stats import NOTES, REFERENCE, curves, grid_to, references
 from nrp_jax.bench.curve_table import to_text
 from nrp_jax.homes.houses import CELLS
-from nrp_jax.planners.by_name import check_names
+from nrp_jax.planners.by_name import KINDS, check_names
+from nrp_jax.samplers import check_fits, load_sampler
 from nrp_jax.scene.robots import load_robot
+from nrp_jax.scene.world import build_world
 from vrrt_jax.core import command, workers
 from vrrt_jax.core.peers import ompl_version
 from vrrt_jax.core.results_file import append_row, plain, resume_rows, write
@@ -82,7 +84,8 @@ def run(benchmark: CurveBenchmark, file: Path | None) -> dict[str, Any]:
         :func:`nrp_jax.bench.curve_stats.curves`) and more.
 
     Raises:
-        ValueError: the rows are of another benchmark, version or seed.
+        ValueError: the rows are of another benchmark, version or seed, or a planner's network does
+            not fit a home's map.
         OSError: a file cannot be written; the rows that were written stay.
     """
     header, rows = measure(benchmark, file)
@@ -99,6 +102,7 @@ def measure(
     header, homes = benchmark.header(), benchmark.setting.homes
     rows_file = None if file is None else file.with_name(f"{file.name}.rows")
     rows = [] if rows_file is None else resume_rows(rows_file, header)
+    _check_samplers(benchmark)
     done = {(row["planner"], row["home"], row["query"], row["run"]) for row in rows}
     todo = [
         item
@@ -116,6 +120,20 @@ def measure(
             bar.set_postfix_str(f"{100 * won / max(tried, 1):.0f} % solved")
             bar.update()
     return header, rows
+
+
+def _check_samplers(benchmark: CurveBenchmark) -> None:
+    """Refuse at once what would end a run half way: a map that a planner's network cannot see."""
+    robot = load_robot(benchmark.setting.task)
+    for name in benchmark.planners:
+        if name not in KINDS:
+            continue
+        sampler = load_sampler(robot.name, KINDS[name])
+        for home in benchmark.setting.homes:
+            try:
+                check_fits(sampler, robot, build_world(robot, home.grid), KINDS[name])
+            except ValueError as error:
+                raise ValueError(f"{name} in '{home.name}': {error}") from None
 
 
 def summary(

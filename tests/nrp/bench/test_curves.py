@@ -105,6 +105,10 @@ def test_a_run_that_was_cut_goes_on(measured, command, capsys):
         (["--homes", "home.npz", "--poses", "short.json"], "has 1 poses; expected two at least"),
         (["--homes", "home.npz", "--poses", "text.json"], "holds no poses"),
         (
+            ["--homes", "long.npz", "--poses", "poses.json", "--planners", "rrt,next"],
+            "next in 'long': the map has 120 x 40 cells; networks that see the whole map see 100",
+        ),
+        (
             ["--homes", "home.npz", "--task", "fetch"],
             "'home.npz': this robot needs a map with heights",
         ),
@@ -114,6 +118,7 @@ def test_bad_options_are_told_in_one_line(options, words, folder, monkeypatch, c
     monkeypatch.chdir(folder)
     (folder / "short.json").write_text(json.dumps({"left": POSES["left"]}))
     (folder / "text.json").write_text("left: 1, 2")
+    nrp_jax.Grid(occupied=np.zeros((120, 40), bool)).save(folder / "long.npz")
     assert main(["bench", "curves", *options]) == 2
     told = capsys.readouterr().err.splitlines()
     assert words in told[-1] and not any("Traceback" in line for line in told)
