@@ -36,6 +36,7 @@ ATTEMPT_KEY = 0x7FFFFFFF  # folded into the key of a later attempt; iterations c
 MORE_EACH = 2  # attempts that do more than the one before
 CONFIRMING = 2  # more attempts where a match is in doubt, or has no path
 DOUBTFUL = 0.5  # of the threshold; a match with a larger loss is in doubt
+UNLIKELY = 0.5  # probability of a match; one below is looked for again as if it were none
 ROOT_SAMPLES, ROOT_BATCHES = 4096, 8  # random configurations, of which some are roots
 
 
@@ -62,6 +63,7 @@ def plan_by_loss(
             few_more = result.status in (Status.NO_PATH, Status.NOT_VERIFIED)
             few_more |= _is_in_doubt(result)
             goes_on = result.status is Status.NO_MATCH or (few_more and again <= CONFIRMING)
+            goes_on |= _is_in_doubt(result) and result.match_probability < UNLIKELY
             if not goes_on or rest.budget.time_limit_s == 0:
                 break
             key = jax.random.fold_in(key, ATTEMPT_KEY - again)
