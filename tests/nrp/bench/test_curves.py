@@ -106,7 +106,7 @@ def test_a_run_that_was_cut_goes_on(measured, command, capsys):
         (["--homes", "home.npz", "--poses", "text.json"], "holds no poses"),
         (
             ["--homes", "long.npz", "--poses", "poses.json", "--planners", "rrt,next"],
-            "next in 'long.npz': the map has 120 x 40 cells; networks that see the whole map see 100",
+            "next in 'long.npz': the map has 120 x 40 cells; networks that see the whole map",
         ),
         (
             ["--homes", "home.npz", "--task", "fetch"],
