@@ -28,8 +28,8 @@ from vrrt_jax.core.types import pytree
 if TYPE_CHECKING:  # data sets are made with what is here
     from nrp_jax.learning.data import Dataset
 
+FULL_PROGRESS = 2.0  # a candidate so much nearer to the goal could not be better [m]
 # Each query that is turned by itself is turned by all quarters, of which one is kept.
-FULL_PROGRESS = 2.0  # nearer to the goal [m]
 LARGE_IMAGE = 100_000  # cells
 LIMITS = np.array([[4], [2]])  # of quarter turns, and of mirrors
 

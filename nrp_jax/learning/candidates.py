@@ -170,6 +170,7 @@ def _draw(robot, world: GridWorld, q_from, q_goal, key: jax.Array, num: int) -> 
     inputs = network_inputs(config, robot, world, q_from, q_goal)
     key_drawn, key_chosen = jax.random.split(key)
     drawn = draw_candidates(robot, world, inputs, q_from, q_goal, key_drawn, num=DRAWN)
-    scored = drop_colliding(robot, inputs, *(x[:, 1:] for x in drawn), max(num, MAX_SCORED))
+    q, points, possible = (x[:, 1:] for x in drawn)
+    scored = drop_colliding(robot, inputs, q, points, possible, max(num, MAX_SCORED))
     q = jax.random.permutation(key_chosen, scored[0], axis=1)[:, :num]
     return enforce_bounds(world, features.to_world(q, inputs.center[:, None]))

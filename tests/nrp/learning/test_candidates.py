@@ -33,8 +33,8 @@ def test_candidates_are_drawn_as_nrp_d_draws_them_and_judged_by_their_edges(worl
     fraction = jnp.linspace(0.0, 1.0, 64)[1:, None, None]
     edge = world.edge(rows.q_start, rows.waypoint)
     along = np.asarray(rows.q_start + fraction * edge).reshape(-1, 8)
-    free = np.asarray(batch_is_free(world, along)).reshape(63, -1).all(axis=0)
-    reached = np.isfinite(rows.ratio)
+    free = np.asarray(batch_is_free(world, along)).reshape(63, -1)
+    free, reached = np.all(free, axis=0), np.isfinite(rows.ratio)
     assert 0.2 < reached.mean() < 0.8 and rows.ratio.min() >= 1.0
     assert free[reached].mean() > 0.97 and free[~reached].mean() < 0.1
 
