@@ -21,23 +21,19 @@ from nrp_jax.guides import NEXTGuide
 from nrp_jax.homes.grid import HEIGHT, RESOLUTION
 from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning import features
-from nrp_jax.learning.batches import describe, read_image, relations
+from nrp_jax.learning.batches import describe, relations
+from nrp_jax.learning.candidates import DRAWN, MAX_SCORED, draw_candidates, drop_colliding
 from nrp_jax.learning.checkpoint import Model, build_module, check_model, load_model
 from nrp_jax.learning.edge_check import first_free
 from nrp_jax.learning.experience_database import load_database
-from nrp_jax.learning.local_map import SIDE
 from nrp_jax.learning.models import FIRE, GLOBAL_CVAE, NEXT, ModelConfig, check_choices
 from nrp_jax.learning.network_inputs import NetworkInputs, network_inputs
 from nrp_jax.retrieval import ExperienceSampler
-from nrp_jax.scene.robots import MobileRobot, batch_link_features, load_robot
+from nrp_jax.scene.robots import MobileRobot, load_robot
 from nrp_jax.scene.world import GridWorld
-from vrrt_jax.core.edges import difference, enforce_bounds
+from vrrt_jax.core.edges import enforce_bounds
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import pytree, static
-
-HALF_WINDOW = SIDE / 2 * RESOLUTION  # from the center of a local window to its sides [m]
-POSTURES = 16  # drawn between a start's posture and a goal's
-POSTURE_NOISE = 1.0  # largest deviation of a joint from these postures [rad] or [m]
 
 
 class Sampler(Protocol):
@@ -72,8 +68,8 @@ class DiscriminatorSampler:
     robot: MobileRobot
     variables: Any  # weights, flax variables
     config: ModelConfig = static()
-    candidates: int = static(default=256)  # drawn for a lane, a multiple of ``POSTURES``
-    max_scored: int = static(default=96)  # candidates that the network scores, at most
+    candidates: int = static(default=DRAWN)  # drawn for a lane, a multiple of ``POSTURES``
+    max_scored: int = static(default=MAX_SCORED)  # candidates that the network scores, at most
     # The edges to so many of the best candidates are checked; the first that is free is taken.
     num_edge_checked: int = static(default=16)
     edge_checks: int = static(default=12)  # configurations checked along each of these edges
@@ -89,19 +85,13 @@ class DiscriminatorSampler:
     ) -> tuple[jax.Array, jax.Array]:
         """Waypoints as :meth:`propose` makes them, and how many configurations it checked."""
         inputs = network_inputs(self.config, self.robot, world, q_from, q_goal)
-        q, points = self._candidates(world, q_from, q_goal, key)
-        # Candidates are drawn around the start. A window is centered there; a whole map is not.
-        if self.config.scope == "map":
-            shift = jnp.pad(features.to_local(q_from, inputs.center)[:, :2], ((0, 0), (0, 1)))
-            q = q.at[..., :2].add(shift[:, None, :2])
-            points = points + shift[:, None, None]
-        # The goal is the first candidate, where it lies in the window.
-        q = jnp.concatenate([inputs.ends[:, 1:], q], axis=1)
-        points = jnp.concatenate([inputs.end_points[:, 1:], points], axis=1)
-        near = jnp.max(jnp.abs(q_goal - q_from)[:, :2], axis=1) < HALF_WINDOW
-        possible = jnp.ones(q.shape[:2], bool).at[:, 0].set(near)
+        q, points, possible = draw_candidates(
+            self.robot, world, inputs, q_from, q_goal, key, num=self.candidates
+        )
         if self.config.lookup and self.max_scored < q.shape[1]:
-            q, points, possible = self._drop_colliding(inputs, q, points, possible)
+            q, points, possible = drop_colliding(
+                self.robot, inputs, q, points, possible, self.max_scored
+            )
         logits = self._score(inputs, q, points)
         # The best candidates, back in the map and inside the limits.
         num = min(self.num_edge_checked, q.shape[1])
@@ -109,35 +99,6 @@ class DiscriminatorSampler:
         chosen = jnp.take_along_axis(q, best[..., None], axis=1)
         chosen = enforce_bounds(world, features.to_world(chosen, inputs.center[:, None]))
         return first_free(world, q_from, chosen, self.edge_checks)
-
-    def _candidates(
-        self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Random configurations (B, C, D) about the start and their link frames (B, C, F, 3)."""
-        key_posture, key_place = jax.random.split(key)
-        shape = (len(q_from), round(self.candidates / POSTURES), POSTURES)
-        place = jax.random.uniform(key_place, (*shape, 2), minval=-HALF_WINDOW, maxval=HALF_WINDOW)
-        q = _postures(self.robot, world, q_from, q_goal, key_posture)
-        # Kinematics once a posture: at another place, the same posture's frames only shift.
-        frames = jax.vmap(batch_link_features, (None, 0))(self.robot, q)
-        q = jnp.broadcast_to(q[:, None], (*shape, q.shape[-1])).at[..., :2].set(place)
-        frames = frames[:, None] + jnp.pad(place, [(0, 0)] * 3 + [(0, 1)])[..., None, :]
-        return jax.tree.map(
-            lambda x: x.reshape(len(x), shape[1] * POSTURES, *x.shape[3:]), (q, frames)
-        )
-
-    def _drop_colliding(
-        self, inputs: NetworkInputs, q: jax.Array, points: jax.Array, possible: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Keep ``max_scored`` of the candidates, those first that stand in no solid cell."""
-        standing = jax.vmap(jax.vmap(functools.partial(features.standing_points, self.robot)))
-        clearance = jax.vmap(read_image)(inputs.image, standing(q, points))
-        blocked = jnp.min(clearance, axis=-1) <= 0
-        rank = jnp.where(possible, jnp.where(blocked, 1.0, 2.0), 0.0)
-        _, kept = jax.lax.top_k(rank, self.max_scored)
-        return jax.vmap(lambda kept, arrays: jax.tree.map(lambda x: x[kept], arrays))(
-            kept, (q, points, possible)
-        )
 
     def _score(self, inputs: NetworkInputs, q: jax.Array, points: jax.Array) -> jax.Array:
         """The network's logits (B, C) for candidates (B, C, D) with link frames (B, C, F, 3)."""
@@ -167,24 +128,6 @@ def proposed(
     if hasattr(sampler, "propose_and_count"):
         return sampler.propose_and_count(world, q_from, q_goal, key)
     return sampler.propose(world, q_from, q_goal, key), 0
-
-
-def _postures(
-    robot: MobileRobot, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
-) -> jax.Array:
-    """Configurations (B, POSTURES, D) at the origin, with arms between the starts' and the goals'.
-
-    A base that turns gets a random heading.
-    """
-    step = difference(world, q_from, q_goal)[:, None]
-    q = q_from[:, None] + jnp.linspace(0.0, 1.0, POSTURES)[:, None] * step
-    key_noise, key_scale = jax.random.split(key)
-    noise = jax.random.uniform(key_noise, q.shape, minval=-1.0, maxval=1.0)
-    # Small deviations are more frequent than large ones: the scale is a squared uniform number.
-    scale = POSTURE_NOISE * jax.random.uniform(key_scale, (*q.shape[:2], 1)) ** 2
-    base = jnp.arange(q.shape[-1]) < robot.base_dim
-    q = jnp.where(base, jnp.pi * noise, q + scale * noise)
-    return enforce_bounds(world, q.at[..., :2].set(0.0)).at[..., :2].set(0.0)
 
 
 @single_precision

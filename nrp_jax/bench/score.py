@@ -1,6 +1,6 @@
 """The ``nrp score`` command: optimality scores of samplers on homes that no network has seen.
 
-:mod:`nrp_jax.bench.optimality` says what the score is.
+:mod:`nrp_jax.learning.optimality` says what the score is.
 """
 
 import argparse
@@ -19,10 +19,10 @@ import numpy as np
 
 from nrp_jax import samplers
 from nrp_jax.bench.maps import load_maps
-from nrp_jax.bench.optimality import make_queries, optimality
 from nrp_jax.homes.grid import Grid
 from nrp_jax.learning.data import load_dataset
 from nrp_jax.learning.models import TASKS, WAYPOINT_KINDS
+from nrp_jax.learning.optimality import make_queries, optimality
 from nrp_jax.learning.roadmap import Roadmap, build_roadmap, load_roadmap
 from nrp_jax.learning.shards import VERSION, home_seed
 from nrp_jax.scene.robots import MobileRobot, load_robot

@@ -8,7 +8,7 @@ queries of a batch, ``D`` joints, ``F`` link frames, ``E`` features.
 
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +17,18 @@ import numpy as np
 from nrp_jax.homes.grid import RESOLUTION, Grid
 from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning import features, local_map
-from nrp_jax.learning.data import Dataset
 from nrp_jax.learning.expert import GOOD_RATIO
-from nrp_jax.learning.models import MAP_KINDS, ModelConfig
+from nrp_jax.learning.models import MAP_KINDS, WAYPOINT_KINDS, ModelConfig
+from nrp_jax.learning.optimality import progress
 from nrp_jax.scene.field import DistanceField, make_field
 from nrp_jax.scene.robots import MobileRobot, batch_link_features
+from nrp_jax.scene.world import build_world
 from vrrt_jax.core.types import pytree
 
+if TYPE_CHECKING:  # data sets are made with what is here
+    from nrp_jax.learning.data import Dataset
+
+FULL_PROGRESS = 2.0  # a candidate so much nearer to the goal could not be better [m]
 # Each query that is turned by itself is turned by all quarters, of which one is kept.
 LARGE_IMAGE = 100_000  # cells
 LIMITS = np.array([[4], [2]])  # of quarter turns, and of mirrors
@@ -104,7 +109,7 @@ def local_image(
 
 
 def load_examples(
-    config: ModelConfig, robot: MobileRobot, dataset: Dataset, *, soft: bool = True
+    config: ModelConfig, robot: MobileRobot, dataset: "Dataset", *, soft: bool = True
 ) -> Examples:
     """Put those rows of a data set on the device that a model learns from.
 
@@ -114,8 +119,9 @@ def load_examples(
         config: of the model to train.
         robot: whose configurations they are.
         dataset: from :func:`nrp_jax.learning.data.load_dataset`.
-        soft: the target of a discriminator falls off exponentially with the detour; otherwise it
-            is 1 for good waypoints and 0 for others.
+        soft: the target of a discriminator is how much nearer to the goal a candidate is, 1 from
+            ``FULL_PROGRESS`` on; or falls off exponentially with the detour of a waypoint.
+            Otherwise it is 1 for good ones and 0 for others.
 
     Raises:
         ValueError: the data set is of another task, or of rows that such a model does not learn
@@ -126,23 +132,29 @@ def load_examples(
             f"the data set is of task '{dataset.settings.task}', the model of '{config.task}'; "
             "give another data set, or the other --task"
         )
-    if dataset.settings.paths != (config.kind in MAP_KINDS):
-        holds, option = ("paths", "without") if dataset.settings.paths else ("waypoints", "with")
+    kinds = {"paths": MAP_KINDS, "waypoints": WAYPOINT_KINDS, "candidates": ("discriminator",)}
+    holds = dataset.settings.holds
+    if config.kind not in kinds.get(holds, ()):
+        wanted = [name for name, learning in kinds.items() if config.kind in learning]
         raise ValueError(
-            f"the data set holds {holds}, but a '{config.kind}' learns from other rows; give one "
-            f"that nrp data wrote {option} --paths, or another --model"
+            f"the data set holds {holds}, but a '{config.kind}' learns from {' or '.join(wanted)}; "
+            "give one that nrp data wrote with the option of that name (waypoints: with none), or "
+            "another --model"
         )
     rows = dataset.rows
+    grids = [grid.flatten() if robot.planar else grid for grid in dataset.grids]
     # Which rows, and how good their waypoints are.
     good = rows["ratio"] <= GOOD_RATIO
     if config.kind != "discriminator":
         rows = {name: column[good] for name, column in rows.items()}
         target = weight = np.ones(good.sum())
+    elif soft and holds == "candidates":
+        target = np.minimum(progress(build_world(robot, grids[0]), rows) / FULL_PROGRESS, 1.0)
+        weight = np.ones(len(good))
     else:
         detour = np.maximum(rows["ratio"] - 1.0, 0.0)
         target = np.exp(-detour / (GOOD_RATIO - 1.0)) if soft else good.astype(np.float32)
         weight = np.ones(len(good))
-    grids = [grid.flatten() if robot.planar else grid for grid in dataset.grids]
     return make_examples(config, robot, grids, rows, target=target, weight=weight)
 
 

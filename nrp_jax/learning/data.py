@@ -271,6 +271,9 @@ def add_arguments(subparsers) -> None:
     kind.add_argument(
         "--experiences", action="store_true", help="corners of shortened paths, for --model fire"
     )
+    kind.add_argument(
+        "--candidates", action="store_true", help="what NRP-d chooses among, for its discriminator"
+    )
     workers.add_arguments(parser, jobs=usable_cores())
 
 
@@ -285,6 +288,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         paths=arguments.paths,
         experiences=arguments.experiences,
+        candidates=arguments.candidates,
     )
     with tqdm(unit="home", disable=None) as bar:
 

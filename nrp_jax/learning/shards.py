@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from nrp_jax.homes import houses
+from nrp_jax.learning.candidates import make_candidate_rows
 from nrp_jax.learning.difficulty import fair_house
 from nrp_jax.learning.experiences import make_experience_rows
 from nrp_jax.learning.expert import make_rows
@@ -38,8 +39,15 @@ class DatasetSettings:
     seed: int = 0
     paths: bool = False  # waypoints are states along whole paths, for a global CVAE
     experiences: bool = False  # waypoints are the corners of shortened paths, for FIRE
+    candidates: bool = False  # waypoints are those that NRP-d chooses among
     homes_version: int = houses.VERSION
     rows_version: int = VERSION
+
+    @property
+    def holds(self) -> str:
+        """What the waypoints of the rows are: "waypoints", "candidates", "paths", "experiences"."""
+        other = ("candidates", "paths", "experiences")
+        return next((name for name in other if getattr(self, name)), "waypoints")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -79,6 +87,7 @@ def make_shard(settings: DatasetSettings, wanted: tuple[str, int]) -> tuple[str,
     rng = np.random.default_rng(seed)
     make = make_path_rows if settings.paths else make_rows
     make = make_experience_rows if settings.experiences else make
+    make = make_candidate_rows if settings.candidates else make
     rows = make(world, robot, roadmap, rng, settings.queries, settings.waypoints)
     packed = io.BytesIO()
     np.savez_compressed(

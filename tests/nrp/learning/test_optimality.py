@@ -5,7 +5,7 @@ import numpy as np
 from nrp_synthetic import random_grid
 
 from nrp_jax import build_world, load_robot
-from nrp_jax.bench.optimality import make_queries, optimality
+from nrp_jax.learning.optimality import make_queries, optimality
 from nrp_jax.learning.roadmap import build_roadmap
 
 

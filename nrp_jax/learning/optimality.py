@@ -9,6 +9,7 @@ its score is 1 too. Letters: ``N`` nodes, ``G`` goals, ``D`` joints, ``n`` queri
 """
 
 import dataclasses
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,7 @@ from nrp_jax.learning.roadmap import Extents, Roadmap
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld, batch_is_free
 
-ROUND = 256  # edges from a waypoint into the roadmap that are checked in one round
+ROUND = 64  # edges from a waypoint into the roadmap that are checked in one round
 _BATCH = 1024  # edges whose lengths one compiled call computes
 
 
@@ -34,9 +35,17 @@ class Queries:
     goals: np.ndarray  # (G,) indices of nodes
     cost: np.ndarray  # (G, N) lengths of the shortest paths from each node to each goal
 
+    def take(self, index: np.ndarray) -> "Queries":
+        """Some of the queries (m,), perhaps several times."""
+        return dataclasses.replace(self, start=self.start[index], goal=self.goal[index])
+
 
 def make_queries(
-    world: GridWorld, robot: MobileRobot, roadmap: Roadmap, num: int, seed: int
+    world: GridWorld,
+    robot: MobileRobot,
+    roadmap: Roadmap,
+    num: int,
+    seed: int | np.random.Generator,
 ) -> Queries:
     """Draw starts and goals as the data sets have them; fewer than ``num`` goals, shared."""
     rng = np.random.default_rng(seed)
@@ -96,6 +105,15 @@ def optimality(
     shortest = queries.cost[queries.goal, queries.start]
     score = shortest / np.maximum(first + best, 1e-9)
     return np.where(free, np.minimum(score, 1.0), 0.0)
+
+
+def progress(world: GridWorld, rows: Mapping[str, np.ndarray]) -> np.ndarray:
+    """How much nearer to the goal (n,) the waypoints of rows are than their starts [m].
+
+    It is 0 for waypoints that cannot be reached, or that are farther from it.
+    """
+    edge = np.asarray(_batch_lengths(world, rows["q_start"], rows["waypoint"]))
+    return np.maximum(edge - (rows["ratio"] - 1.0) * rows["length"], 0.0)
 
 
 def _lengths(world: GridWorld, q: np.ndarray, own: int, near: np.ndarray) -> np.ndarray:
