@@ -1,6 +1,7 @@
 """Planning from the outside: goals, planners, no re-compilation, attempts, batches."""
 
 import dataclasses
+import itertools
 from typing import Any
 
 import jax
@@ -176,6 +177,26 @@ def test_another_attempt_while_nothing_matches(
     monkeypatch.setattr(attempts_module, "attempt", lambda *_: next(attempts))
     result = vrrt_jax.plan(*args, key=jax.random.key(0), config=config)
     assert result.status is vrrt_jax.Status.INTERRUPTED and result.loss == results[0].loss
+
+    # A match in doubt is looked for again, and longer if it is unlikely too.
+    threshold = results[0].match_threshold
+    for loss, color, probability, expected in (
+        (0.4, 0.9, 0.3, 1),
+        (0.6, 0.9, 0.8, 3),
+        (0.4, 1.1, 0.8, 3),
+        (0.6, 0.9, 0.3, 6),
+    ):
+        match = dataclasses.replace(
+            results[0],
+            status=vrrt_jax.Status.SOLVED,
+            loss=loss * threshold,
+            colored_loss=color * threshold,
+            match_probability=probability,
+        )
+        attempts = itertools.count(1)
+        monkeypatch.setattr(attempts_module, "attempt", lambda *_: next(attempts) and match)  # noqa: B023
+        assert vrrt_jax.plan(*args, key=jax.random.key(0), config=config).ok
+        assert next(attempts) - 1 == expected
 
 
 def test_a_guess_becomes_a_root(panda, self_model, camera, image, open_world):
