@@ -58,7 +58,15 @@ parser = command.Parser(prog="vrrt")
 parser.add_subparsers(dest="command").add_parser("forget").set_defaults(run=run)
 raise SystemExit(command.run(parser, ["forget"]))
 """
-STARTING = "import sys; sys.argv[0] = 'nrp'; print('working', flush=True); import nrp_jax.cli"
+# A command that imports its modules, and on a fast machine waits for the interrupt after that.
+STARTING = """
+import sys, time
+sys.argv[0] = "nrp"
+print("working", flush=True)
+import nrp_jax.cli
+
+time.sleep(600)
+"""
 
 
 def interrupt(code, tmp_path, after=0.0):
