@@ -58,11 +58,17 @@ parser = command.Parser(prog="vrrt")
 parser.add_subparsers(dest="command").add_parser("forget").set_defaults(run=run)
 raise SystemExit(command.run(parser, ["forget"]))
 """
-# A command that imports its modules, and on a fast machine waits for the interrupt after that.
+# A command that imports its modules; it tells when it has begun to listen.
 STARTING = """
-import sys, time
+import signal, sys, time
 sys.argv[0] = "nrp"
-print("working", flush=True)
+listen = signal.signal
+
+def tell(*args):
+    listen(*args)
+    print("working", flush=True)
+
+signal.signal = tell
 import nrp_jax.cli
 
 time.sleep(600)
