@@ -95,6 +95,8 @@ def _check_room(file: Path, size: int) -> None:
 
     Where they run out under way, threads of orbax print pages that nothing can catch.
     """
+    if not hasattr(os, "posix_fallocate"):  # as on macOS
+        return
     try:
         with file.open("wb") as handle:
             os.posix_fallocate(handle.fileno(), 0, size)
