@@ -60,10 +60,10 @@ def plan_by_loss(
         for again in range(1, config.budget.attempts):
             rest = time_left(config, result.timing["search_s"])
             # A match in doubt is believed if a few more attempts find no better one.
-            few_more = result.status in (Status.NO_PATH, Status.NOT_VERIFIED)
-            few_more |= _is_in_doubt(result)
+            in_doubt = _is_in_doubt(result)
+            few_more = in_doubt or result.status in (Status.NO_PATH, Status.NOT_VERIFIED)
             goes_on = result.status is Status.NO_MATCH or (few_more and again <= CONFIRMING)
-            goes_on |= _is_in_doubt(result) and result.match_probability < UNLIKELY
+            goes_on |= in_doubt and result.match_probability < UNLIKELY
             if not goes_on or rest.budget.time_limit_s == 0:
                 break
             key = jax.random.fold_in(key, ATTEMPT_KEY - again)

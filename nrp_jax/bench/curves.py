@@ -125,13 +125,13 @@ def measure(
 def _check_samplers(benchmark: CurveBenchmark) -> None:
     """Refuse at once what would end a run half way: a map that a planner's network cannot see."""
     robot = load_robot(benchmark.setting.task)
-    for name in benchmark.planners:
-        if name not in KINDS:
-            continue
-        sampler = load_sampler(robot.name, KINDS[name])
-        for home in benchmark.setting.homes:
+    learned = [name for name in benchmark.planners if name in KINDS]
+    samplers = {kind: load_sampler(robot.name, kind) for kind in {KINDS[name] for name in learned}}
+    for home in benchmark.setting.homes if learned else ():
+        world = build_world(robot, home.grid)
+        for name in learned:
             try:
-                check_fits(sampler, robot, build_world(robot, home.grid), KINDS[name])
+                check_fits(samplers[KINDS[name]], robot, world, KINDS[name])
             except ValueError as error:
                 raise ValueError(f"{name} in '{home.name}': {error}") from None
 

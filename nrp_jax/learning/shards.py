@@ -24,6 +24,12 @@ from vrrt_jax.core.files import replacing
 from vrrt_jax.core.workers import in_workers
 
 VERSION = 6  # of rows, checks of their edges and choice of homes; other versions are refused
+_MAKERS = {  # by what the rows hold
+    "waypoints": make_rows,
+    "paths": make_path_rows,
+    "experiences": make_experience_rows,
+    "candidates": make_candidate_rows,
+}
 ROWS = ("q_start", "q_goal", "waypoint", "optimal", "ratio", "length", "query")
 FIRST_TEST_SEED = 1_000_000  # seeds of test homes begin here, those of training homes are below
 
@@ -85,9 +91,7 @@ def make_shard(settings: DatasetSettings, wanted: tuple[str, int]) -> tuple[str,
     world = build_world(robot, house.grid)
     roadmap = build_roadmap(world, robot, jax.random.key(seed), settings.nodes)
     rng = np.random.default_rng(seed)
-    make = make_path_rows if settings.paths else make_rows
-    make = make_experience_rows if settings.experiences else make
-    make = make_candidate_rows if settings.candidates else make
+    make = _MAKERS[settings.holds]
     rows = make(world, robot, roadmap, rng, settings.queries, settings.waypoints)
     packed = io.BytesIO()
     np.savez_compressed(

@@ -26,10 +26,9 @@ def with_waypoints(world: GridWorld, path: np.ndarray) -> tuple[np.ndarray, np.n
     within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + 1
     fraction = (within / counts[index]).astype(np.float32)
     # Always as many at a time, so that whatever the path's length nothing compiles anew.
+    columns = path[index], path[index + 1], fraction
     points = [
-        _interpolate(
-            world, *(_block(rows, begin) for rows in (path[index], path[index + 1], fraction))
-        )
+        _interpolate(world, *(_block(column, begin) for column in columns))
         for begin in range(0, len(index), BLOCK)
     ]
     steps = unwrapped(world, np.concatenate([path[:1], np.concatenate(points)[: len(index)]]))

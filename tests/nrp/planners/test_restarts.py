@@ -29,6 +29,13 @@ class Unasked:
         raise AssertionError
 
 
+@pytest.fixture(scope="module")
+def world():
+    """The snake in an open room."""
+    grid = nrp_jax.Grid(occupied=np.zeros((50, 40), bool))
+    return nrp_jax.build_world(nrp_jax.load_robot("snake"), grid)
+
+
 def test_the_shortest_path_is_kept_until_the_budget_ends():
     occupied = np.zeros((50, 40), bool)
     occupied[24:26] = True
@@ -57,10 +64,7 @@ def test_the_shortest_path_is_kept_until_the_budget_ends():
     assert found.stopped in (StopReason.REACHED, StopReason.ITERATIONS)
 
 
-def test_what_compiles_at_first_takes_none_of_the_budget():
-    world = nrp_jax.build_world(
-        nrp_jax.load_robot("snake"), nrp_jax.Grid(occupied=np.zeros((50, 40), bool))
-    )
+def test_what_compiles_at_first_takes_none_of_the_budget(world):
     goal = nrp_jax.ConfigurationGoal(q=jnp.asarray(GOAL))
     policy = NRPConnect(sampler=Unasked(), straight_iterations=1000)
     asked = []
@@ -85,10 +89,7 @@ def test_what_compiles_at_first_takes_none_of_the_budget():
     assert found.compile_s > 1.0 > found.history[np.isfinite(found.history[:, 4])][0, 1]
 
 
-def test_what_is_refused_is_no_path():
-    world = nrp_jax.build_world(
-        nrp_jax.load_robot("snake"), nrp_jax.Grid(occupied=np.zeros((50, 40), bool))
-    )
+def test_what_is_refused_is_no_path(world):
     goal = nrp_jax.ConfigurationGoal(q=jnp.asarray(GOAL))
     policy = NRPConnect(sampler=Unasked(), straight_iterations=1000)
     shared = {"termination": make_termination(0.0, max_iterations=24), "time_limit_s": 60.0}
@@ -111,10 +112,7 @@ def test_what_is_refused_is_no_path():
     assert path is None and not np.isfinite(found.history[:, 4]).any()
 
 
-def test_what_is_refused_is_shortened_in_parts():
-    world = nrp_jax.build_world(
-        nrp_jax.load_robot("snake"), nrp_jax.Grid(occupied=np.zeros((50, 40), bool))
-    )
+def test_what_is_refused_is_shortened_in_parts(world):
     # A detour, and a place in it that a path may not leave out.
     kept = (START + GOAL) / 2 + np.array([0, 1, *np.zeros(6)], np.float32)
     path = np.linspace(START, kept, 9), np.linspace(kept, GOAL, 9)[1:]
