@@ -88,6 +88,7 @@ def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.n
     if not bool(batch_is_free(world, q[None])):
         touching = (
             contacts(robot, world, q)
+            or contacts(robot, world, q, geometry="polytopes")
             or contacts(robot, world, q, geometry="spheres")
             or touching_spheres(world, q)
         )

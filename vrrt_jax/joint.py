@@ -25,9 +25,10 @@ from vrrt_jax.core.search import (
 from vrrt_jax.core.types import ExpansionPolicy
 from vrrt_jax.outcome import JOINT_ADVICE, Chosen, Progress, finish, time_left
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.world import World, checked_more_finely, keeping_clearance
+from vrrt_jax.scene.world import World, checked_more_finely, rooms
 
 WARY_SHARE = 0.15  # of the iterations are searched with a clearance to keep, then without
+SPHERES_SHARE = 0.5  # of them are searched by spheres alone, then by polytopes too
 
 
 @single_precision
@@ -83,33 +84,32 @@ def _attempt(
     """One attempt, which keeps ``config.path.margin`` from everything if it can.
 
     It keeps less where start or goal are nearer than that. If no path is found soon, one is
-    searched for without. A plan that starts at its goal has nothing to search for.
+    searched for without, and at last by polytopes where spheres touch. A plan that starts at its
+    goal has nothing to search for.
     """
     if starts_at(goal, world, q_start):
         tree = policy.init(world, goal, q_start[None], config.tree.capacity)
         chosen = _chosen(world, goal, q_start[None], q_start)
         result = finish(robot, world, no_search(policy, goal, tree), chosen, q_start, key, config)
         return dataclasses.replace(result, advice=JOINT_ADVICE[result.status])
-    wary = keeping_clearance(world, np.vstack([q_start, goal.q]), config.path.margin)
     limit = config.budget.max_iterations
-    # A planner that goes on to improve gets all of its iterations with the clearance.
+    # A planner that goes on to improve gets all of its iterations in the wariest room.
     improves = policy.goal_score(goal) == -np.inf
-    first = limit if improves or wary is world else max(int(WARY_SHARE * limit), 1)
-    found, path = _search(wary, goal, policy, q_start, key, first, config, on_progress)
-    chosen = _chosen(world, goal, path, q_start)
-    is_there = path is not None and chosen.loss <= chosen.threshold
-    if not is_there and wary is not world and found.stopped is StopReason.ITERATIONS:
-        left = time_left(config, found.search_s)
-        rest = limit if improves else max(limit - first, 1)
-        again, path = _search(world, goal, policy, q_start, key, rest, left, on_progress)
+    compile_s = search_s = done = 0.0
+    for room in rooms(world, np.vstack([q_start, goal.q]), config.path.margin):
+        share = WARY_SHARE if room.margin > world.margin else SPHERES_SHARE
+        share = 1.0 if improves else 1.0 - done if room is world else share
+        done += share
+        iterations = max(round(share * limit), 1)
+        own = time_left(config, search_s)
+        found, path = _search(room, goal, policy, q_start, key, iterations, own, on_progress)
+        compile_s, search_s = compile_s + found.compile_s, search_s + found.search_s
         chosen = _chosen(world, goal, path, q_start)
-        found = dataclasses.replace(
-            again,
-            compile_s=found.compile_s + again.compile_s,
-            search_s=found.search_s + again.search_s,
-        )
-    room = wary if is_there else None
-    result = finish(robot, world, found, chosen, q_start, key, config, room)
+        is_there = path is not None and chosen.loss <= chosen.threshold
+        if is_there or found.stopped is not StopReason.ITERATIONS:
+            break
+    found = dataclasses.replace(found, compile_s=compile_s, search_s=search_s)
+    result = finish(robot, world, found, chosen, q_start, key, config, room if is_there else None)
     status = result.status
     if path is None:
         status = STATUS_OF.get(found.stopped, Status.NO_PATH)

@@ -1,4 +1,4 @@
-"""Write the collision model of a robot as MJCF: bodies, joints and spheres, no mesh."""
+"""Write the collision model of a robot as MJCF: bodies, joints, spheres and polytopes."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
@@ -17,8 +17,11 @@ from vrrt_jax.robots.xml_file import check_mjcf
 # self-collision spheres against each other, and nothing else.
 COLLISION_GEOM = {"group": "3", "contype": "0", "conaffinity": "1"}
 SELF_COLLISION_GEOM = {"group": "4", "contype": "2", "conaffinity": "2"}
-# The names of both kinds in the text: packaged files carry them.
+# Polytopes touch nothing in this model: they are for a second look at what spheres touch.
+POLYTOPE_GEOM = {"group": "5", "contype": "8", "conaffinity": "8"}
+# The names of the kinds in the text: packaged files carry them.
 _CLASSES = (("cover", COLLISION_GEOM), ("thin", SELF_COLLISION_GEOM))
+_POLYTOPE = "polytope"
 _SOURCE = "mesh_source"
 FROZEN = "frozen: "  # before the names of joints, in custom numbers: where each is fixed
 
@@ -29,6 +32,7 @@ def collision_mjcf(
     name: str,
     collision: BodySpheres,
     self_collision: BodySpheres,
+    polytopes: Mapping[int, Sequence[np.ndarray]],
     ignored_pairs: Sequence[tuple[str, str]],
     home: np.ndarray,
     mesh_source: str | None,
@@ -42,6 +46,8 @@ def collision_mjcf(
         name: of the robot.
         collision: spheres checked against obstacles.
         self_collision: spheres checked against each other.
+        polytopes: by body the vertices (V, 3) of what contains it [m]; see
+            :func:`vrrt_jax.robots.polytopes.outer_polytopes`.
         ignored_pairs: pairs of bodies that are not checked against each other.
         home: (D,) joint positions of the keyframe [rad] or [m].
         mesh_source: where the true geometry is found, kept for :func:`source_of`.
@@ -56,8 +62,10 @@ def collision_mjcf(
         root, "compiler", angle="radian", autolimits="true", boundmass="1", boundinertia="0.01"
     )
     default = ET.SubElement(root, "default")
-    for label, bits in _CLASSES:
-        ET.SubElement(ET.SubElement(default, "default", {"class": label}), "geom", bits)
+    polytope_class = [(_POLYTOPE, POLYTOPE_GEOM | {"type": "mesh"})] if polytopes else []
+    for label, fields in (*_CLASSES, *polytope_class):
+        ET.SubElement(ET.SubElement(default, "default", {"class": label}), "geom", fields)
+    asset = ET.SubElement(root, "asset")
     # Bodies come parents first, so that the parent's element always stands already.
     elements = {0: ET.SubElement(root, "worldbody")}
     for body in range(model.nbody):
@@ -68,6 +76,10 @@ def collision_mjcf(
             for k in np.flatnonzero(spheres.body == body):
                 where = {"pos": _numbers(spheres.center[k]), "size": _numbers(spheres.radius[k])}
                 ET.SubElement(elements[body], "geom", {"class": label} | where)
+        for k, vertices in enumerate(polytopes.get(body, ())):
+            mesh = f"{model.body(body).name}_{k}"
+            ET.SubElement(asset, "mesh", name=mesh, vertex=_numbers(vertices.ravel()))
+            ET.SubElement(elements[body], "geom", {"class": _POLYTOPE, "mesh": mesh})
     # What MJCF has no element for is kept as custom text and numbers.
     custom = ET.SubElement(root, "custom")
     if mesh_source is not None:
@@ -80,6 +92,36 @@ def collision_mjcf(
     ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="home", qpos=_numbers(home))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def is_polytope(model: mujoco.MjModel) -> np.ndarray:
+    """Which geoms (ngeom,) bool of a written model are polytopes."""
+    return (
+        (model.geom_group == int(POLYTOPE_GEOM["group"]))
+        & (model.geom_contype == int(POLYTOPE_GEOM["contype"]))
+        & (model.geom_conaffinity == int(POLYTOPE_GEOM["conaffinity"]))
+        & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)
+    )
+
+
+def keep_geoms(spec: mujoco.MjSpec, *, polytopes: bool) -> bool:
+    """Delete the spheres of a written model, or its polytopes, in place.
+
+    Args:
+        spec: of a text by :func:`collision_mjcf`.
+        polytopes: whether they stay, and the spheres go, if there are any.
+
+    Returns:
+        Whether polytopes are what is left.
+    """
+    group = int(POLYTOPE_GEOM["group"])
+    polytopes &= any(geom.group == group for geom in spec.geoms)
+    for geom in list(spec.geoms):
+        if (geom.group == group) != polytopes:
+            spec.delete(geom)
+    for mesh in () if polytopes else list(spec.meshes):
+        spec.delete(mesh)
+    return polytopes
 
 
 def renamed(text: str, name: str) -> str:
@@ -112,7 +154,7 @@ def _with_comments() -> ET.XMLParser:
 
 
 def replace_spheres(text: str, fitted: str) -> str:
-    """A written model with the spheres and the ignored pairs of another one.
+    """A written model with the spheres, polytopes and ignored pairs of another one.
 
     What was added to the first by hand stays: joints, positions at home, custom numbers.
 
@@ -139,9 +181,9 @@ def replace_spheres(text: str, fitted: str) -> str:
         for geom in reversed(others[name].findall("geom")):
             body.insert(place, geom)
     # The comment says where the spheres come from.
-    for tag in (ET.Comment, "contact"):
-        place = next(k for k, part in enumerate(root) if part.tag == tag)
-        root[place] = next(part for part in other if part.tag == tag)
+    for tag in (ET.Comment, "default", "asset", "contact"):
+        place = next((k for k, part in enumerate(root) if part.tag == tag), len(root))
+        root[place : place + 1] = [part for part in other if part.tag == tag]
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
 

@@ -23,6 +23,7 @@ from vrrt_jax.robots.kinematics import (
     spheres_on_links,
 )
 from vrrt_jax.robots.packaged import robot_names, robot_path
+from vrrt_jax.robots.polytopes import Polytope, polytopes_on_links
 from vrrt_jax.robots.robot_spheres import RobotSpheres, spheres_of
 from vrrt_jax.robots.self_collision_radii import fit_radii
 
@@ -53,6 +54,7 @@ class Robot:
     self_collision_sphere_bodies: tuple[str, ...]  # body of each of them, for messages
     self_collision_pairs: np.ndarray  # (P, 2) i32 indices of self-collision spheres to check
     ignored_pairs: tuple[tuple[str, str], ...]  # pairs of bodies that are never checked
+    polytopes: tuple[Polytope, ...]  # contain the bodies more tightly than spheres; may be none
     frozen: Mapping[str, float]  # joints of the true geometry that are fixed [rad] or [m]
     xml: str  # the collision model as MJCF; compiles by itself, without any mesh
     mesh_source: str | None  # name or file of the true geometry, see ``mesh_sources.mesh_spec``
@@ -108,9 +110,13 @@ def _loaded(name_or_path: str | Path, path: Path, freeze: Mapping[str, float] | 
     self_collision_spheres, ignored_pairs = spheres.self_collision, self_collision.excluded(model)
     if spheres.origin != "written":
         self_collision_spheres, ignored_pairs = _prepare_self_collision(
-            model, spheres, ignored_pairs, write
+            model, spheres, ignored_pairs, functools.partial(write, polytopes={})
         )
-    xml = write(self_collision=self_collision_spheres, ignored_pairs=ignored_pairs)
+    xml = write(
+        self_collision=self_collision_spheres,
+        ignored_pairs=ignored_pairs,
+        polytopes=spheres.polytopes,
+    )
     return _robot(
         model=mujoco.MjModel.from_xml_string(xml),
         ignored_pairs=tuple(ignored_pairs),
@@ -132,7 +138,8 @@ def _prepare_self_collision(
         model: the robot with its true geometry.
         spheres: of the robot.
         ignored_pairs: what the file excludes from contact.
-        write: :func:`vrrt_jax.robots.mjcf_writer.collision_mjcf` but for the two results.
+        write: :func:`vrrt_jax.robots.mjcf_writer.collision_mjcf` but for the two results, and
+            without polytopes.
     """
     if not self_collision.can_touch_itself(model):
         warnings.warn(
@@ -222,6 +229,7 @@ def _robot(*, model: mujoco.MjModel, **fields) -> Robot:
         upper=upper,
         is_continuous=model.jnt_limited == 0,
         home=model.key_qpos[0].copy(),
+        polytopes=polytopes_on_links(model, body_link, body_in_link),
         self_collision_pairs=self_collision.checked_pairs(
             model, geoms_of_kind["self_collision_sphere"]
         ),

@@ -13,6 +13,7 @@ from vrrt_jax.robots.convex_parts import contain_surface
 from vrrt_jax.robots.geom_pieces import collision_pieces
 from vrrt_jax.robots.kinematics import BodySpheres
 from vrrt_jax.robots.mesh_sources import install_hint, mesh_spec
+from vrrt_jax.robots.polytopes import outer_polytopes
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.robots.robot_spheres import spheres_of
 from vrrt_jax.robots.self_collision import (
@@ -94,14 +95,15 @@ def fit_spheres(
         comment=_comment(robot.name, num_spheres, seed),
     )
     write = functools.partial(write, ignored_pairs=ignored_pairs)
+    draft = functools.partial(write, polytopes={})
     if self_collision == "new":
-        thin = _self_collision_spheres(model, samples, sample, write, rng)
+        thin = _self_collision_spheres(model, samples, sample, draft, rng)
     else:
         thin = _own_spheres(model, own)
         if self_collision == "radii":
-            thin = _with_radii(model, thin, sample, write)
+            thin = _with_radii(model, thin, sample, draft)
     progress(f"{len(thin.body)} spheres take part in self-collision")
-    return write(self_collision=thin)
+    return write(self_collision=thin, polytopes=outer_polytopes(model))
 
 
 def _self_collision_spheres(
@@ -163,6 +165,7 @@ def _comment(name: str, num_spheres: int, seed: int) -> str:
   Written by the command `vrrt spheres` for {name}: {num_spheres} collision spheres, seed {seed}.
   cover: contain the convex collision meshes of the moving bodies; checked against obstacles.
   thin: touch each other where the meshes do, as nearly as so many spheres can.
+  polytope: contain the convex collision meshes of all bodies, more tightly than spheres.
   exclude: bodies that share a joint, and bodies whose meshes touch in none of
   {_CONFIGURATIONS:,} random configurations.
 """

@@ -1,4 +1,4 @@
-"""The spheres that a robot is loaded with: those of its file, or a cover made just now."""
+"""The spheres and polytopes that a robot is loaded with: its file's, or made just now."""
 
 import dataclasses
 from typing import Literal
@@ -8,6 +8,7 @@ import numpy as np
 
 from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.kinematics import BodySpheres
+from vrrt_jax.robots.polytopes import outer_polytopes, read_polytopes
 from vrrt_jax.robots.sphere_cover import cover_convex_parts
 
 _MOST_SELF_COLLISION = 100  # self-collision spheres of one body
@@ -24,6 +25,9 @@ class RobotSpheres:
     # "fitted": the file has other geoms, covered just now. The self-collision spheres then cover
     # their bodies too, and are too large for their purpose until their radii are fitted.
     origin: Literal["written", "own", "fitted"]
+    # By body the vertices (V, 3) of what contains it more tightly, in its frame [m]; none of
+    # bodies that are spheres.
+    polytopes: dict[int, list[np.ndarray]]
 
 
 def spheres_of(model: mujoco.MjModel) -> RobotSpheres:
@@ -36,6 +40,7 @@ def spheres_of(model: mujoco.MjModel) -> RobotSpheres:
         ValueError: it has no collision geom, or one that spheres cannot be fitted to.
     """
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    collides &= ~mjcf_writer.is_polytope(model)  # of a file that `vrrt spheres` wrote
     geoms = np.flatnonzero(collides)
     if len(geoms) == 0:
         raise ValueError(
@@ -48,7 +53,10 @@ def spheres_of(model: mujoco.MjModel) -> RobotSpheres:
         if np.bincount(cover.body).max() > _MOST_SELF_COLLISION:
             cover = cover_convex_parts(model, most=_MOST_SELF_COLLISION)
         return RobotSpheres(
-            collision=_on_moving_bodies(model, fine), self_collision=cover, origin="fitted"
+            collision=_on_moving_bodies(model, fine),
+            self_collision=cover,
+            origin="fitted",
+            polytopes=outer_polytopes(model),
         )
     # A file that `vrrt spheres` wrote marks both kinds by their groups and contact bits.
     is_collision = _is_kind(model, geoms, mjcf_writer.COLLISION_GEOM)
@@ -60,6 +68,7 @@ def spheres_of(model: mujoco.MjModel) -> RobotSpheres:
         collision=_on_moving_bodies(model, _read(model, geoms[is_collision])),
         self_collision=_read(model, geoms[is_self_collision]),
         origin="written" if has_kinds else "own",
+        polytopes=read_polytopes(model) if has_kinds else {},
     )
 
 

@@ -45,7 +45,10 @@ class ClosedFormWorld(World):
             (place(spheres.collision, poses), place(spheres.self_collision, poses))
         )
         clearance = spheres.clearances(self.obstacles, outer, self.margin)
-        return spheres.free_span(clearance, inner, edge)
+        gaps = spheres.gaps(inner)
+        span = spheres.free_span(clearance, gaps, edge)
+        found = spheres.look_again(self.obstacles, self.margin, poses, edge, clearance, gaps, span)
+        return found[0]
 
     @single_precision
     def obstacle_clearance(self, q: jax.Array) -> jax.Array:
@@ -66,6 +69,11 @@ class ClosedFormWorld(World):
         if not self.attached:
             return {}
         return {"spheres": self.spheres.among(self.attached, [o.name for o in obstacles])}
+
+    def by_spheres_alone(self) -> Self:
+        """See :meth:`vrrt_jax.scene.world.World.by_spheres_alone`."""
+        spheres = dataclasses.replace(self.spheres, narrow_phase=None)
+        return dataclasses.replace(self, spheres=spheres)
 
     def with_margin(self, margin: float | jax.Array) -> Self:
         """See :func:`vrrt_jax.scene.world.with_margin`."""

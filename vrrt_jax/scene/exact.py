@@ -29,7 +29,7 @@ from vrrt_jax.scene.held import HeldObject
 from vrrt_jax.scene.obstacles import Obstacle, check_obstacle, floats
 from vrrt_jax.scene.world import World, obstacle_list
 
-_GEOMETRIES = ("auto", "meshes", "spheres")
+_GEOMETRIES = ("auto", "meshes", "polytopes", "spheres")
 _FRAME_TOLERANCE = 1e-3  # [m] between the body frames of meshes and of spheres at home
 _KEPT = 8  # compiled scenes that a thread keeps, the latest ones
 COMPILING = threading.Lock()  # MuJoCo's compiler is for one thread at a time
@@ -43,7 +43,7 @@ class _Compiled:
 
     model: mujoco.MjModel
     data: mujoco.MjData
-    geometry: str  # "meshes" or "spheres"
+    geometry: str  # one of _GEOMETRIES but "auto"
     num_bodies: int  # bodies from this index on are obstacles, one each
     slots: Mapping[str, np.ndarray]  # of each kind of obstacle, its geoms
     robot_geoms: np.ndarray  # (r,) int, geoms of moving bodies that are checked against obstacles
@@ -89,7 +89,7 @@ class ExactScene:
 
     @property
     def geometry(self) -> str:
-        """What the robot is made of: "meshes" or "spheres"."""
+        """What the robot is made of: "meshes", "polytopes" or "spheres"."""
         return self.compiled.geometry
 
     @property
@@ -284,24 +284,29 @@ def _build(
     held: tuple[tuple[str, str], ...],
 ) -> _Compiled:
     """The robot with room for obstacles, which threads copy."""
-    spec = None if geometry == "spheres" else mesh_spec(robot, visuals=False)
+    spec = mesh_spec(robot, visuals=False) if geometry in ("auto", "meshes") else None
     if spec is None and geometry == "meshes":
         raise ValueError(
             f"the meshes of robot '{robot.name}' are not on this machine: "
-            f"{install_hint(robot.mesh_source)}, or use geometry='spheres'"
+            f"{install_hint(robot.mesh_source)}, or use geometry='polytopes'"
         )
-    # True meshes where they are to be had, else the covering spheres.
+    # True meshes where they are to be had, else the polytopes or spheres that cover them.
     has_meshes = spec is not None
-    spheres = mujoco.MjSpec.from_string(robot.xml)
-    spec = spec or spheres
+    covers = mujoco.MjSpec.from_string(robot.xml)
+    has_polytopes = mjcf_writer.keep_geoms(covers, polytopes=geometry != "spheres")
+    made_of = "meshes" if has_meshes else "polytopes" if has_polytopes else "spheres"
+    spec = spec or covers
     if has_meshes:
-        _check_same_robot(robot, spec.copy().compile(), spheres.compile())
+        _check_same_robot(robot, spec.copy().compile(), covers.compile())
         _exclude(spec, robot.ignored_pairs)
         boxes_to_meshes(spec)
-    held_names = add_held(spec, held, HELD_BITS["meshes" if has_meshes else "spheres"])
+    elif has_polytopes:
+        for geom in spec.geoms:
+            geom.contype = geom.conaffinity = ALL_BITS
+    held_names = add_held(spec, held, HELD_BITS[made_of])
     num_bodies = len(spec.bodies)
     # Collision spheres see bit 0 only, and self-collision spheres see no obstacle.
-    add_slots(spec, room, bits=ALL_BITS if has_meshes else 1)
+    add_slots(spec, room, bits=1 if made_of == "spheres" else ALL_BITS)
     spec.memory = 1 << 23  # room for the contacts of a robot deep inside an obstacle
     model = spec.compile()
     # Contacts are reported from afar; MuJoCo adds up the margins of a pair. Trees of boxes inside
@@ -312,7 +317,7 @@ def _build(
     measure_rightly(model)
     # Which geoms are measured against obstacles for the clearance.
     sees_obstacles = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    if not has_meshes:
+    if made_of == "spheres":
         sees_obstacles = model.geom_group == int(mjcf_writer.COLLISION_GEOM["group"])
     held_bodies = tuple(model.body(name).id for name in held_names)
     sees_obstacles |= np.isin(model.geom_bodyid, held_bodies)
@@ -321,7 +326,7 @@ def _build(
     return _Compiled(
         model=model,
         data=mujoco.MjData(model),
-        geometry="meshes" if has_meshes else "spheres",
+        geometry=made_of,
         num_bodies=num_bodies,
         slots=slots_of(model, num_bodies),
         robot_geoms=np.flatnonzero(sees_obstacles & is_moving),

@@ -12,11 +12,15 @@ from vrrt_jax.scene.exact_slots import ALL_BITS
 from vrrt_jax.scene.held import HeldObject
 from vrrt_jax.scene.obstacle_kinds import KINDS
 
-# contype and conaffinity of held objects. Meshes see everything. Among spheres they see obstacles
-# and self-collision spheres, as the robot's links do. A bit of their own is for collision spheres
-# of links that have no others.
+# contype and conaffinity of held objects. Meshes and polytopes see everything. Among spheres they
+# see obstacles and self-collision spheres, as the robot's links do. A bit of their own is for
+# collision spheres of links that have no others.
 _THIN, _OWN = int(mjcf_writer.SELF_COLLISION_GEOM["contype"]), 4
-HELD_BITS = {"meshes": (ALL_BITS, ALL_BITS), "spheres": (_THIN | _OWN, _THIN | 1)}
+HELD_BITS = {
+    "meshes": (ALL_BITS, ALL_BITS),
+    "polytopes": (ALL_BITS, ALL_BITS),
+    "spheres": (_THIN | _OWN, _THIN | 1),
+}
 
 
 def add_held(

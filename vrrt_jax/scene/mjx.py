@@ -2,7 +2,8 @@
 
 MJX's pairs of geoms are fixed when a model is compiled. So a model has room for some obstacles of
 each type; those not in use are parked far away, and a type that a scene lacks costs nothing.
-Only signs of MJX's distances are used: for boxes it gives no more than that.
+Only signs of MJX's distances are used: for boxes it gives no more than that. What its spheres touch
+is looked at again, see :mod:`vrrt_jax.scene.narrow_phase`.
 
 What comes first, a broad phase, is what makes it fast: an obstacle is first touched by the sphere
 that is nearest to it, so that MJX judges one pair for each obstacle, not one for each sphere. MJX's
@@ -31,7 +32,8 @@ from vrrt_jax.scene.flat_program import FlatProgram, flat_program
 from vrrt_jax.scene.held import HeldObject
 from vrrt_jax.scene.obstacle_kinds import KINDS
 from vrrt_jax.scene.obstacles import PARKED, Obstacle, Obstacles, signed_distances, to_slots
-from vrrt_jax.scene.spheres import WorldSpheres, least, world_spheres
+from vrrt_jax.scene.rows import least, over_rows
+from vrrt_jax.scene.spheres import WorldSpheres, world_spheres
 from vrrt_jax.scene.world import World
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used, is absent
@@ -74,7 +76,7 @@ class MjxWorld(World):
     @single_precision
     def is_free(self, q: jax.Array) -> jax.Array:
         """See :func:`vrrt_jax.scene.world.is_free`."""
-        return self._answer(q)[0]
+        return self._span(q, jnp.zeros_like(q)) >= 0
 
     def free_span(self, q: jax.Array, edge: jax.Array) -> jax.Array:
         """See :class:`vrrt_jax.core.edges.Space`.
@@ -84,9 +86,23 @@ class MjxWorld(World):
         """
         if overrides_is_free(self):
             return super().free_span(q, edge)
-        is_free, clearance, inner = self._answer(q)
-        span = self.spheres.free_span(clearance, inner, edge)
-        return jnp.where(is_free, jnp.maximum(span, 0.0), -1.0)
+        return self._span(q, edge)
+
+    def _span(self, q: jax.Array, edge: jax.Array) -> jax.Array:
+        """See :meth:`free_span`, where MJX alone is asked."""
+        is_free, clearance, poses = self._answer(q)
+        # Behind a barrier the centers are computed once, and not again for every pair.
+        inner = jax.lax.optimization_barrier(place(self.spheres.self_collision, poses))
+        if self.spheres.num_held[0]:
+            held = self.spheres.held_clearances(self.obstacles, self.margin, poses)
+            is_free &= jnp.all(held > 0) & self.spheres.held_are_apart(inner)
+            clearance = jnp.append(clearance, held)
+        gaps = self.spheres.gaps(inner)
+        span = self.spheres.free_span(clearance, gaps, edge)
+        span = jnp.where(is_free, jnp.maximum(span, 0.0), -1.0)
+        return self.spheres.look_again(
+            self.obstacles, self.margin, poses, edge, clearance, gaps, span
+        )[0]
 
     @single_precision
     def obstacle_clearance(self, q: jax.Array) -> jax.Array:
@@ -97,19 +113,12 @@ class MjxWorld(World):
         """Whether ``q`` (D,) is free, () bool, and what tells how far.
 
         Returns:
-            () bool; distances (n,) of collision spheres to obstacles, less the margin [m]; centers
-            (3, m) of self-collision spheres [m].
+            () bool; distances (n,) of the robot's collision spheres to obstacles, less the margin
+            [m]; poses (L, 3, 4) of links.
         """
         inputs = jax.lax.stop_gradient((self.geoms, self.margin, self.spheres.self_margin, q))
-        *others, q = inputs
-        is_free, clearance, poses = (part[0] for part in self.scene.answers(others, q[None]))
-        # Behind a barrier the centers are computed once, and not again for every pair.
-        inner = jax.lax.optimization_barrier(place(self.spheres.self_collision, poses))
-        if self.spheres.num_held[0]:
-            held = self.spheres.held_clearances(self.obstacles, self.margin, poses)
-            is_free &= jnp.all(held > 0) & self.spheres.held_are_apart(inner)
-            clearance = jnp.append(clearance, held)
-        return is_free, clearance, inner
+        *common, q = inputs
+        return jax.tree.map(lambda part: part[0], self.scene.answers(tuple(common), q[None]))
 
     def holding(self, attached: Sequence[HeldObject]) -> Self:
         """See :meth:`vrrt_jax.scene.world.World.holding`."""
@@ -119,6 +128,11 @@ class MjxWorld(World):
             attached=TraceIgnoredNames(attached),
             spheres=spheres.farther_apart(float(self.spheres.self_margin)),
         )
+
+    def by_spheres_alone(self) -> Self:
+        """See :meth:`vrrt_jax.scene.world.World.by_spheres_alone`."""
+        spheres = dataclasses.replace(self.spheres, narrow_phase=None)
+        return dataclasses.replace(self, spheres=spheres)
 
     def with_margin(self, margin: float | jax.Array) -> Self:
         """See :func:`vrrt_jax.scene.world.with_margin`."""
@@ -219,33 +233,8 @@ class MjxScene:
 
     @functools.cached_property
     def answers(self) -> Any:
-        """:meth:`answer` of configurations (n, D), as ``(inputs before q, q)``.
-
-        Under any number of ``vmap``, configurations become one batch.
-        """
-
-        @jax.custom_batching.custom_vmap
-        def answers(others: Any, q: jax.Array) -> tuple[jax.Array, ...]:
-            return _answers(self, others, q)
-
-        @answers.def_vmap
-        def batch(size: int, is_batched: Any, others: Any, q: jax.Array) -> Any:
-            outputs = (True,) * len(self.program.outputs)
-            if any(jax.tree.leaves(is_batched[0])):  # several worlds, one after another
-
-                def one(index: jax.Array) -> tuple[jax.Array, ...]:
-                    row = jax.tree.map(
-                        lambda leaf, batched: leaf[index] if batched else leaf,
-                        [others, q],
-                        is_batched,
-                    )
-                    return answers(*row)
-
-                return jax.lax.map(one, jnp.arange(size)), outputs
-            flat = answers(others, q.reshape(size * q.shape[1], q.shape[2]))
-            return tuple(part.reshape(size, q.shape[1], *part.shape[1:]) for part in flat), outputs
-
-        return answers
+        """:meth:`answer` of configurations (n, D), as ``(inputs before q, q)``."""
+        return over_rows(functools.partial(_answers, self))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -290,6 +279,7 @@ def mjx_scene(xml: str, room: tuple[int, ...]) -> MjxScene:
         room: for obstacles of each type of ``_PAIRED``, and for all others.
     """
     spec = mujoco.MjSpec.from_string(xml)
+    mjcf_writer.keep_geoms(spec, polytopes=False)
     types = [geom for geom, count in zip(_PAIRED, room, strict=False) for _ in range(count)]
     has_spheres = any(g.group == int(mjcf_writer.COLLISION_GEOM["group"]) for g in spec.geoms)
     # Bodies of their own: what the robot's file excludes from contact with the world's body, its

@@ -1,13 +1,16 @@
-"""How well spheres agree with the true geometry: misses and false alarms in C MuJoCo."""
+"""How well what planners collide with agrees with the true geometry in C MuJoCo."""
 
 import dataclasses
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.robots.robot import Robot
+from vrrt_jax.scene.closed_form import ClosedFormWorld
 from vrrt_jax.scene.exact import ExactScene, exact_scene
 from vrrt_jax.scene.obstacles import Obstacle
+from vrrt_jax.scene.world import batch_is_free, build_world
 
 _SCENES = 20  # random scenes that the configurations are spread over
 _KINDS = ("box", "sphere", "capsule", "cylinder") * 2
@@ -17,21 +20,21 @@ _MIN_DISTANCE = 0.25  # of the arm's reach: free around the base
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """Counts over configurations, spheres against true geometry."""
+    """Counts over configurations, :func:`vrrt_jax.is_free` against true geometry."""
 
     colliding: int  # truly colliding
     free: int  # truly free
-    misses: int  # truly colliding, but the spheres are free
-    false_alarms: int  # truly free, but the spheres collide
+    misses: int  # truly colliding, but free for planners
+    false_alarms: int  # truly free, but refused
 
     @property
     def miss_rate(self) -> float:
-        """Share of the truly colliding configurations that the spheres call free."""
+        """Share of the truly colliding configurations that planners call free."""
         return self.misses / max(self.colliding, 1)
 
     @property
     def false_alarm_rate(self) -> float:
-        """Share of the truly free configurations that the spheres call colliding."""
+        """Share of the truly free configurations that planners refuse."""
         return self.false_alarms / max(self.free, 1)
 
 
@@ -52,8 +55,10 @@ def measure_spheres(
     num: int = 10_000,
     seed: int = 0,
     scenes: Sequence[Sequence[Obstacle]] = (),
+    *,
+    polytopes: bool = True,
 ) -> SphereReport:
-    """Compare a robot's spheres with its true collision geometry, in random configurations.
+    """Compare what planners collide with and the true geometry, in random configurations.
 
     Args:
         robot: from :func:`vrrt_jax.robots.load_robot`.
@@ -61,42 +66,61 @@ def measure_spheres(
         seed: of scenes and configurations.
         scenes: obstacles of each; without any, 20 random scenes of eight boxes, spheres, capsules
             and cylinders.
+        polytopes: look again with them where spheres touch, as planners do.
 
     Raises:
         ValueError: the true geometry is nowhere on this machine.
     """
     rng = np.random.default_rng(seed)
     reach = _reach(robot)
-    rows: list[list[bool]] = []
+    rows = []
     missed: dict[tuple[str, str], int] = {}
-    for index, scene in enumerate(np.array_split(np.arange(num), len(scenes) or _SCENES)):
-        # One scene twice: with the true geometry, and with the spheres.
+    for index, part in enumerate(np.array_split(np.arange(num), len(scenes) or _SCENES)):
         obstacles = scenes[index] if scenes else _random_obstacles(rng, reach)
         truth = exact_scene(robot, obstacles, geometry="meshes")
-        spheres = exact_scene(robot, obstacles, geometry="spheres")
-        for q in rng.uniform(robot.lower, robot.upper, (len(scene), robot.num_joints)):
-            true_pairs, sphere_pairs = _by_kind(truth, q), _by_kind(spheres, q)
-            rows.append([bool(pairs) for pairs in true_pairs + sphere_pairs])
-            for first, second in true_pairs[1] if not sphere_pairs[1] else ():
+        q = rng.uniform(robot.lower, robot.upper, (len(part), robot.num_joints))
+        true_pairs = [_by_kind(truth, row) for row in q]
+        refused = [~free for free in _free(robot, obstacles, q, polytopes)]
+        rows.append(np.column_stack([[[bool(p) for p in pairs] for pairs in true_pairs], *refused]))
+        for pairs, is_refused in zip(true_pairs, refused[1], strict=True):
+            for first, second in pairs[1] if not is_refused else ():
                 names = truth.model.body(first).name, truth.model.body(second).name
                 missed[names] = missed.get(names, 0) + 1
-    found = np.array(rows)
+    found = np.concatenate(rows)
     return SphereReport(
         obstacles=_agreement(found[:, 0], found[:, 2]),
         self_collision=_agreement(found[:, 1], found[:, 3]),
-        either=_agreement(found[:, 0] | found[:, 1], found[:, 2] | found[:, 3]),
+        either=_agreement(found[:, 0] | found[:, 1], found[:, 4]),
         num=num,
         seed=seed,
         missed=missed,
     )
 
 
-def _agreement(truth: np.ndarray, spheres: np.ndarray) -> Agreement:
+def _free(
+    robot: Robot, obstacles: Sequence[Obstacle], q: np.ndarray, polytopes: bool
+) -> list[np.ndarray]:
+    """Whether q (n, D) are free of obstacles, of the robot itself, and of both, (n,) bool each."""
+    among, alone = (
+        build_world(robot, things, engine="closed_form", num_slots=len(obstacles))
+        for things in (obstacles, [])
+    )
+    if not polytopes:
+        among, alone = among.by_spheres_alone(), alone.by_spheres_alone()
+    assert isinstance(among, ClosedFormWorld)
+    # Contact distances of zero mark pairs that are not checked.
+    unchecked = jnp.zeros_like(among.spheres.contact_distance)
+    spheres = dataclasses.replace(among.spheres, contact_distance=unchecked)
+    worlds = dataclasses.replace(among, spheres=spheres), alone, among
+    return [np.asarray(batch_is_free(world, np.float32(q))) for world in worlds]
+
+
+def _agreement(truth: np.ndarray, refused: np.ndarray) -> Agreement:
     return Agreement(
         colliding=int(truth.sum()),
         free=int((~truth).sum()),
-        misses=int((truth & ~spheres).sum()),
-        false_alarms=int((~truth & spheres).sum()),
+        misses=int((truth & ~refused).sum()),
+        false_alarms=int((~truth & refused).sum()),
     )
 
 

@@ -11,7 +11,9 @@ import numpy as np
 from vrrt_jax.core.types import pytree, static
 from vrrt_jax.robots.kinematics import Spheres, lever_arms, place, placement
 from vrrt_jax.scene.held import HeldObject, HeldSpheres, gripped_distances, together
+from vrrt_jax.scene.narrow_phase import NarrowPhase, look_again, narrow_phase
 from vrrt_jax.scene.obstacles import Obstacles, signed_distances
+from vrrt_jax.scene.rows import least
 
 _ROUNDING = 0.999  # of spans: what single precision may round
 
@@ -36,14 +38,15 @@ class WorldSpheres:
     relative_lever_arms: jax.Array  # (D, a, b) the same units
     self_margin: jax.Array  # () what is in the contact distances beside radii [m]
     num_held: tuple[int, int] = static(default=(0, 0))  # how many of n, and of m
+    narrow_phase: NarrowPhase | None  # None: what the spheres say stands
 
     def clearances(
         self, obstacles: Obstacles, centers: jax.Array, margin: jax.Array | float = 0.0
     ) -> jax.Array:
         """Distances (n,) of collision spheres at (3, n), larger by a margin, to obstacles [m]."""
-        return least(signed_distances(obstacles, centers) - self._needed(margin))
+        return least(signed_distances(obstacles, centers) - self.needed(margin))
 
-    def _needed(self, margin: jax.Array | float) -> jax.Array:
+    def needed(self, margin: jax.Array | float) -> jax.Array:
         """At which distances (K, n) of their centers collision spheres touch obstacles [m]."""
         return jnp.minimum(self.radius + margin, self.gripped_distance)
 
@@ -55,13 +58,21 @@ class WorldSpheres:
         outer, inner = jax.lax.optimization_barrier(
             (place(self.collision, poses), place(self.self_collision, poses))
         )
-        # A robot of few links may have no pair to check: then nothing can touch.
-        apart = jnp.all(least(self.squared_gaps(inner)) >= 0)
-        return jnp.all(self.clearances(obstacles, outer, margin) > 0) & apart
+        clearance, gaps = self.clearances(obstacles, outer, margin), self.gaps(inner)
+        edge = jnp.zeros(self.lever_arms.shape[:1], poses.dtype)
+        span = jnp.where(_are_apart(clearance, gaps), 0.0, -1.0)
+        return self.look_again(obstacles, margin, poses, edge, clearance, gaps, span)[0] >= 0
 
     def smallest_clearance(self, obstacles: Obstacles, poses: jax.Array) -> jax.Array:
-        """Of all collision spheres, () [m], on links posed by (L, 4, 4)."""
-        return jnp.min(self.clearances(obstacles, place(self.collision, poses)))
+        """Of all collision spheres, or polytopes where these touch, () [m]; links at (L, 4, 4)."""
+        clearance = self.clearances(obstacles, place(self.collision, poses))
+        edge = jnp.zeros(self.lever_arms.shape[:1], poses.dtype)
+        is_free = jnp.all(clearance > 0)
+        span = jnp.where(is_free, 0.0, -1.0)
+        gaps = jnp.full(self.contact_distance.shape, jnp.inf)
+        margin = jnp.float32(0.0)
+        again = self.look_again(obstacles, margin, poses, edge, clearance, gaps, span)[1]
+        return jnp.where(is_free, jnp.min(clearance), again)
 
     def squared_gaps(self, centers: jax.Array) -> jax.Array:
         """Squared distances less squared contact distances (a, b) [m^2] of spheres at (3, m)."""
@@ -73,29 +84,64 @@ class WorldSpheres:
         x, y, z = centers[:, :a, None] - centers[:, None, centers.shape[1] - b :]
         return x**2 + y**2 + z**2
 
-    def free_span(self, clearance: jax.Array, inner: jax.Array, edge: jax.Array) -> jax.Array:
+    def gaps(self, centers: jax.Array) -> jax.Array:
+        """Distances (a, b) of self-collision spheres at (3, m) [m], infinite if not checked."""
+        apart = jnp.sqrt(self._squared_distances(centers) + 1e-12)
+        return jnp.where(self.contact_distance > 0, apart - self.contact_distance, jnp.inf)
+
+    def free_span(self, clearance: jax.Array, gaps: jax.Array, edge: jax.Array) -> jax.Array:
         """How much of an edge is free for certain: distances divided by the spheres' speeds.
 
         Args:
             clearance: (n,) of collision spheres to obstacles, see :meth:`clearances`.
-            inner: (3, m) centers of self-collision spheres.
+            gaps: (a, b) of self-collision spheres, see :meth:`gaps`.
             edge: (D,) the straight way that the joints go.
 
         Returns:
             () the share of the edge that is free before and after; negative if something touches.
         """
-        # Pairs that are not checked are infinitely far apart.
-        apart = jnp.sqrt(self._squared_distances(inner) + 1e-12)
-        gap = jnp.where(self.contact_distance > 0, apart - self.contact_distance, jnp.inf)
         speed, relative_speed = (
             jnp.tensordot(jnp.abs(edge), arms, 1) + 1e-9
             for arms in (self.lever_arms, self.relative_lever_arms)
         )
         span = jnp.minimum(
-            jnp.min(clearance / speed), jnp.min(gap / relative_speed, initial=jnp.inf)
+            jnp.min(clearance / speed), jnp.min(gaps / relative_speed, initial=jnp.inf)
         )
-        is_free = (jnp.min(clearance) > 0) & (jnp.min(gap, initial=jnp.inf) >= 0)
-        return jnp.where(is_free, _ROUNDING * span, -1.0)
+        return jnp.where(_are_apart(clearance, gaps), _ROUNDING * span, -1.0)
+
+    def look_again(
+        self,
+        obstacles: Obstacles,
+        margin: jax.Array,
+        poses: jax.Array,
+        edge: jax.Array,
+        clearance: jax.Array,
+        gaps: jax.Array,
+        span: jax.Array,
+    ) -> tuple[jax.Array, jax.Array]:
+        """The narrow phase, where spheres touch but not for certain what they cover.
+
+        Args:
+            obstacles: K of them.
+            margin: () asked of obstacles [m].
+            poses: (L, 4, 4) of links.
+            edge: (D,) the straight way that the joints go.
+            clearance: (n,) of collision spheres, see :meth:`clearances`.
+            gaps: (a, b) of self-collision spheres, see :meth:`gaps`.
+            span: () what :meth:`free_span` says.
+
+        Returns:
+            () the span, and () the least distance to obstacles [m], both of polytopes where
+            spheres touch.
+        """
+        nearest = jnp.min(clearance)
+        if self.narrow_phase is None:
+            return span, nearest
+        in_doubt = (span < 0) & self.narrow_phase.is_in_doubt(clearance, gaps)
+        common = jax.lax.stop_gradient((self, obstacles, margin))
+        rows = jax.lax.stop_gradient((poses, edge, span, nearest, in_doubt))
+        span, nearest = look_again(common, jax.tree.map(lambda leaf: leaf[None], rows))
+        return span[0], nearest[0]
 
     def farther_apart(self, margin: float | jax.Array) -> "WorldSpheres":
         """The same spheres, which touch each other while ``margin`` [m] is still between them."""
@@ -118,27 +164,19 @@ class WorldSpheres:
         """:meth:`clearances` (h,) of what the robot holds alone, at link poses (L, 4, 4)."""
         first = len(self.radius) - self.num_held[0]
         centers = place(self.collision[:, first:], poses)
-        return least(signed_distances(obstacles, centers) - self._needed(margin)[:, first:])
+        return least(signed_distances(obstacles, centers) - self.needed(margin)[:, first:])
 
     def held_are_apart(self, inner: jax.Array) -> jax.Array:
         """Whether what is held touches no link, () bool; self-collision spheres at (3, m)."""
         return jnp.all(self.squared_gaps(inner)[:, -self.num_held[1] :] >= 0)
 
 
-def least(rows: jax.Array) -> jax.Array:
-    """The minimum of k rows (k, ...) in each column, inf of no rows; NaN where one is NaN.
+def _are_apart(clearance: jax.Array, gaps: jax.Array) -> jax.Array:
+    """Whether nothing touches, () bool; a robot of few links may have no gap to check.
 
-    Halving is elementwise, and vectorized. In reductions over an axis that is not the last one,
-    XLA's CPU backend computes each element by itself, with all that leads to it.
+    XLA's CPU backend is faster at a minimum than at ``all`` of what is compared.
     """
-    if len(rows) == 0:
-        return jnp.full(rows.shape[1:], jnp.inf, rows.dtype)
-    while len(rows) > 1:
-        half = len(rows) // 2
-        odd = rows[2 * half :]
-        rows = jnp.minimum(rows[:half], rows[half : 2 * half])
-        rows = jnp.minimum(rows, odd) if len(odd) else rows
-    return rows[0]
+    return (jnp.min(clearance) > 0) & (jnp.min(gaps, initial=jnp.inf) >= 0)
 
 
 def world_spheres(
@@ -185,6 +223,7 @@ def world_spheres(
         ),
         self_margin=jnp.float32(0.0),
         num_held=(len(outer.radius), len(held.radius)),
+        narrow_phase=narrow_phase(robot, len(collision[2]), len(radius), num_rows, begin),
     )
     return spheres.among(attached, names) if attached else spheres
 

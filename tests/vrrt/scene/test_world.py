@@ -12,7 +12,7 @@ from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import batch_link_poses, link_poses
 from vrrt_jax.scene.closed_form import ClosedFormWorld
 from vrrt_jax.scene.obstacles import load_obstacles, signed_distances
-from vrrt_jax.scene.spheres import least
+from vrrt_jax.scene.rows import least
 from vrrt_jax.scene.world import (
     World,
     batch_clearance,

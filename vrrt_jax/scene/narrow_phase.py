@@ -1,0 +1,180 @@
+"""The narrow phase: where spheres touch, planes between polytopes tell whether the bodies do.
+
+Spheres that cover a body stick out of it by a centimeter or two. Where they touch something, but
+not so deeply that the body certainly does, :mod:`vrrt_jax.scene.body_polytopes` looks for a plane
+between the two. Where it finds none, what the spheres say stands.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrrt_jax.core.types import pytree
+from vrrt_jax.robots.kinematics import place
+from vrrt_jax.scene.body_polytopes import BodyPolytopes, body_polytopes, bulges
+from vrrt_jax.scene.obstacles import signed_distances
+from vrrt_jax.scene.rows import least, over_rows
+
+
+@pytree
+class NarrowPhase:
+    """The bodies that the spheres of a robot stand for; without polytopes one has the index P.
+
+    Letters as in :class:`vrrt_jax.scene.spheres.WorldSpheres`.
+    """
+
+    polytopes: BodyPolytopes  # of P bodies
+    body: jax.Array  # (n,) i32 that each collision sphere covers
+    bulge: jax.Array  # (n,) what is deeper in a sphere touches the polytope [m]
+    pair_bulge: jax.Array  # (a, b) likewise of two self-collision spheres [m]
+    first_body: jax.Array  # (a,) i32 of self-collision spheres, rows of the contact distances
+    second_body: jax.Array  # (b,) i32 columns likewise
+
+    def is_in_doubt(self, clearance: jax.Array, gaps: jax.Array) -> jax.Array:
+        """Whether () bool no sphere is so deep in something that its body certainly touches it.
+
+        Args:
+            clearance: (n,) of collision spheres to obstacles [m].
+            gaps: (a, b) between self-collision spheres [m].
+        """
+        deepest = jnp.min(gaps + self.pair_bulge, initial=jnp.inf)
+        return (jnp.min(clearance + self.bulge) >= 0) & (deepest >= 0)
+
+
+@over_rows
+def look_again(common: Any, rows: Any) -> tuple[jax.Array, jax.Array]:
+    """What polytopes say of n configurations, of which only those in doubt are looked at.
+
+    Args:
+        common: the spheres, obstacles, and the margin () [m].
+        rows: poses (n, L, 4, 4) of links; edges (n, D); what spheres say: shares (n,) of the edges
+            that are free, distances (n,) to obstacles [m]; and which (n,) bool are in doubt.
+
+    Returns:
+        The shares (n,) and the distances (n,).
+    """
+    spheres, obstacles, margin = common
+    poses, edge, *start = rows
+
+    # One after another: each takes as long as it needs, which no batch could.
+    def look(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        span, nearest, in_doubt = state
+        at = jnp.argmax(in_doubt)
+        found = _look(spheres, obstacles, margin, poses[at], edge[at])
+        return (
+            span.at[at].set(found[0]),
+            nearest.at[at].set(found[1]),
+            in_doubt.at[at].set(False),
+        )
+
+    span, nearest, _ = jax.lax.while_loop(lambda state: jnp.any(state[2]), look, tuple(start))
+    return span, nearest
+
+
+def _look(
+    spheres: Any, obstacles: Any, margin: jax.Array, poses: jax.Array, edge: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """:func:`look_again` at one configuration: () and () [m]."""
+    phase = spheres.narrow_phase
+    outer, inner = place(spheres.collision, poses), place(spheres.self_collision, poses)
+    columns = inner[:, inner.shape[1] - spheres.contact_distance.shape[1] :]
+
+    def at_obstacle(apart: "_Nearest", gaps: "_Nearest") -> "_State":
+        slot, sphere = apart.place
+        body = phase.body[sphere]
+        gap = phase.polytopes.obstacle_gap(body, outer[:, sphere], poses, obstacles, slot) - margin
+        is_pair = (jnp.arange(len(apart.distances)) == slot)[:, None] & (phase.body == body)
+        return apart.at_least(gap, is_pair), gaps, gap > 0
+
+    def at_bodies(apart: "_Nearest", gaps: "_Nearest") -> "_State":
+        row, column = gaps.place
+        first, second = phase.first_body[row], phase.second_body[column]
+        points = inner[:, row], columns[:, column]
+        gap = phase.polytopes.body_gap(first, second, points, poses) - spheres.self_margin
+        is_pair = (phase.first_body == first)[:, None] & (phase.second_body == second)
+        return apart, gaps.at_least(gap, is_pair), gap >= 0
+
+    def is_open(state: "_State") -> jax.Array:
+        apart, gaps, is_apart = state
+        return is_apart & ((apart.least <= 0) | (gaps.least < 0))
+
+    def look(state: "_State") -> "_State":
+        apart, gaps, _ = state
+        return jax.lax.cond(apart.least <= 0, at_obstacle, at_bodies, apart, gaps)
+
+    # The deepest pair first, until one cannot be told apart.
+    apart = _nearest(signed_distances(obstacles, outer) - spheres.needed(margin))
+    start = apart, _nearest(spheres.gaps(inner)), jnp.array(True)
+    apart, gaps, is_apart = jax.lax.while_loop(is_open, look, start)
+    span = jax.lax.cond(
+        is_apart,
+        lambda: spheres.free_span(least(apart.distances), gaps.distances, edge),
+        lambda: jnp.float32(-1.0),
+    )
+    return span, apart.least
+
+
+@pytree
+class _Nearest:
+    """Distances between two kinds of things, and the least of them."""
+
+    distances: jax.Array  # (r, c) [m]
+    least: jax.Array  # () [m]
+    place: tuple[jax.Array, jax.Array]  # () i32 row and column of the least
+
+    def at_least(self, gap: jax.Array, where: jax.Array) -> "_Nearest":
+        """The same distances, of which some (r, c) are known to be at least a gap () [m]."""
+        return _nearest(jnp.where(where, jnp.maximum(self.distances, gap), self.distances))
+
+
+def _nearest(distances: jax.Array) -> _Nearest:
+    """The least of distances (r, c) [m]; infinite if there are none."""
+    if not distances.size:
+        none = jnp.int32(0)
+        return _Nearest(distances=distances, least=jnp.float32(jnp.inf), place=(none, none))
+    # Row by row: XLA's CPU backend vectorizes a minimum, but not the search for its place.
+    row = jnp.argmin(jnp.min(distances, axis=1)).astype(jnp.int32)
+    place = row, jnp.argmin(distances[row]).astype(jnp.int32)
+    return _Nearest(distances=distances, least=distances[place], place=place)
+
+
+# Distances to obstacles, between bodies, and whether all that was looked at is apart, () bool.
+_State = tuple[_Nearest, _Nearest, jax.Array]
+
+
+def narrow_phase(
+    robot: Any, num: int, num_self: int, num_rows: int, begin: int
+) -> NarrowPhase | None:
+    """What the narrow phase needs to know of a robot.
+
+    Args:
+        robot: with or without polytopes.
+        num: n, with held ones.
+        num_self: m, with held ones.
+        num_rows: a.
+        begin: of the m the first of the b.
+    """
+    if not robot.polytopes:
+        return None
+    polytopes, names = body_polytopes(robot.polytopes)
+    index = {name: k for k, name in enumerate(names)}
+
+    def bodies(of_spheres: Sequence[str], size: int) -> np.ndarray:
+        found = [index.get(name, len(names)) for name in of_spheres]
+        return np.array(found + [len(names)] * (size - len(found)), np.int32)
+
+    spheres, others = robot.collision_spheres, robot.self_collision_sphere_bodies
+    bulge, self_bulge = np.zeros(num), np.zeros(num_self)  # what is held is no polytope
+    bulge[: len(spheres.radius)] = bulges(robot.polytopes, robot.collision_sphere_bodies, spheres)
+    self_bulge[: len(others)] = bulges(robot.polytopes, others, robot.self_collision_spheres)
+    return NarrowPhase(
+        polytopes=polytopes,
+        body=jnp.asarray(bodies(robot.collision_sphere_bodies, num)),
+        bulge=jnp.asarray(bulge, jnp.float32),
+        pair_bulge=jnp.asarray(self_bulge[:num_rows, None] + self_bulge[begin:], jnp.float32),
+        first_body=jnp.asarray(bodies(others, num_self)[:num_rows]),
+        second_body=jnp.asarray(bodies(others, num_self)[begin:]),
+    )
