@@ -11,9 +11,9 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection
 from vrrt_jax.robots import mjcf_writer
 from vrrt_jax.robots.geom_pieces import collision_pieces
 
-_MAX_PLANES = 40
+_MAX_PLANES = 48
 _TOLERANCE = 2e-3  # [m] that a polytope may stick out, if it takes no more planes
-_MAX_PARTS = 2  # of a body
+_MAX_PARTS = 4  # of a body
 _ROUNDING = 2e-5  # [m] what is lost in writing and reading
 _SAME_FACE = 1e-3  # normals of faces of one plane differ by no more
 
@@ -34,7 +34,7 @@ def outer_polytopes(model: mujoco.MjModel) -> dict[int, list[np.ndarray]]:
         model: a compiled robot with its true geometry.
 
     Returns:
-        By body the vertices (V, 3) of at most two polytopes, in the frame of the body [m].
+        By body the vertices (V, 3) of at most four polytopes, in the frame of the body [m].
 
     Raises:
         ValueError: a geom has a shape that has no convex hull here.

@@ -72,8 +72,7 @@ class ClosedFormWorld(World):
 
     def by_spheres_alone(self) -> Self:
         """See :meth:`vrrt_jax.scene.world.World.by_spheres_alone`."""
-        spheres = dataclasses.replace(self.spheres, narrow_phase=None)
-        return dataclasses.replace(self, spheres=spheres)
+        return dataclasses.replace(self, spheres=self.spheres.with_narrow_phase(None))
 
     def with_margin(self, margin: float | jax.Array) -> Self:
         """See :func:`vrrt_jax.scene.world.with_margin`."""

@@ -30,6 +30,7 @@ from vrrt_jax.robots.kinematics import link_poses, place
 from vrrt_jax.scene.batch_last import Value, evaluate
 from vrrt_jax.scene.flat_program import FlatProgram, flat_program
 from vrrt_jax.scene.held import HeldObject
+from vrrt_jax.scene.narrow_phase import SLACK
 from vrrt_jax.scene.obstacle_kinds import KINDS
 from vrrt_jax.scene.obstacles import PARKED, Obstacle, Obstacles, signed_distances, to_slots
 from vrrt_jax.scene.rows import least, over_rows
@@ -116,7 +117,9 @@ class MjxWorld(World):
             () bool; distances (n,) of the robot's collision spheres to obstacles, less the margin
             [m]; poses (L, 3, 4) of links.
         """
-        inputs = jax.lax.stop_gradient((self.geoms, self.margin, self.spheres.self_margin, q))
+        between = self.spheres.self_margin
+        between += 0.0 if self.spheres.narrow_phase is None else SLACK
+        inputs = jax.lax.stop_gradient((self.geoms, self.margin, between, q))
         *common, q = inputs
         return jax.tree.map(lambda part: part[0], self.scene.answers(tuple(common), q[None]))
 
@@ -131,8 +134,7 @@ class MjxWorld(World):
 
     def by_spheres_alone(self) -> Self:
         """See :meth:`vrrt_jax.scene.world.World.by_spheres_alone`."""
-        spheres = dataclasses.replace(self.spheres, narrow_phase=None)
-        return dataclasses.replace(self, spheres=spheres)
+        return dataclasses.replace(self, spheres=self.spheres.with_narrow_phase(None))
 
     def with_margin(self, margin: float | jax.Array) -> Self:
         """See :func:`vrrt_jax.scene.world.with_margin`."""

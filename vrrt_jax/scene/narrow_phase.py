@@ -18,6 +18,10 @@ from vrrt_jax.scene.body_polytopes import BodyPolytopes, body_polytopes, bulges
 from vrrt_jax.scene.obstacles import signed_distances
 from vrrt_jax.scene.rows import least, over_rows
 
+# Self-collision spheres are no cover: they miss touches of up to 24 mm, in 0.1 % of configurations.
+# Nearer than this they count as touching where polytopes look again [m].
+SLACK = 0.01
+
 
 @pytree
 class NarrowPhase:
@@ -30,6 +34,7 @@ class NarrowPhase:
     body: jax.Array  # (n,) i32 that each collision sphere covers
     bulge: jax.Array  # (n,) what is deeper in a sphere touches the polytope [m]
     pair_bulge: jax.Array  # (a, b) likewise of two self-collision spheres [m]
+    slack: jax.Array  # (a, b) what is in the contact distances for a second look [m]
     first_body: jax.Array  # (a,) i32 of self-collision spheres, rows of the contact distances
     second_body: jax.Array  # (b,) i32 columns likewise
 
@@ -170,11 +175,16 @@ def narrow_phase(
     bulge, self_bulge = np.zeros(num), np.zeros(num_self)  # what is held is no polytope
     bulge[: len(spheres.radius)] = bulges(robot.polytopes, robot.collision_sphere_bodies, spheres)
     self_bulge[: len(others)] = bulges(robot.polytopes, others, robot.self_collision_spheres)
+    pairs = self_bulge[:num_rows, None] + self_bulge[begin:]
+    first, second = bodies(others, num_self)[:num_rows], bodies(others, num_self)[begin:]
+    have = (first < len(names))[:, None] & (second < len(names))
+    slack = np.where(have, SLACK, 0.0)
     return NarrowPhase(
         polytopes=polytopes,
         body=jnp.asarray(bodies(robot.collision_sphere_bodies, num)),
         bulge=jnp.asarray(bulge, jnp.float32),
-        pair_bulge=jnp.asarray(self_bulge[:num_rows, None] + self_bulge[begin:], jnp.float32),
-        first_body=jnp.asarray(bodies(others, num_self)[:num_rows]),
-        second_body=jnp.asarray(bodies(others, num_self)[begin:]),
+        pair_bulge=jnp.asarray(pairs + slack, jnp.float32),
+        slack=jnp.asarray(slack, jnp.float32),
+        first_body=jnp.asarray(first),
+        second_body=jnp.asarray(second),
     )

@@ -36,7 +36,7 @@ class WorldSpheres:
     # changes, at most while one joint moves by one, see ``kinematics.lever_arms``.
     lever_arms: jax.Array  # (D, n) [m/rad] or [m/m]
     relative_lever_arms: jax.Array  # (D, a, b) the same units
-    self_margin: jax.Array  # () what is in the contact distances beside radii [m]
+    self_margin: jax.Array  # () asked between links, in the contact distances too [m]
     num_held: tuple[int, int] = static(default=(0, 0))  # how many of n, and of m
     narrow_phase: NarrowPhase | None  # None: what the spheres say stands
 
@@ -143,6 +143,13 @@ class WorldSpheres:
         span, nearest = look_again(common, jax.tree.map(lambda leaf: leaf[None], rows))
         return span[0], nearest[0]
 
+    def with_narrow_phase(self, phase: NarrowPhase | None) -> "WorldSpheres":
+        """The same spheres with another narrow phase, or none: its slack is in the distances."""
+        old, new = (0.0 if p is None else p.slack for p in (self.narrow_phase, phase))
+        distance = self.contact_distance
+        distance = jnp.where(distance > 0, distance - old + new, 0.0)
+        return dataclasses.replace(self, narrow_phase=phase, contact_distance=distance)
+
     def farther_apart(self, margin: float | jax.Array) -> "WorldSpheres":
         """The same spheres, which touch each other while ``margin`` [m] is still between them."""
         # A contact distance of zero marks a pair that is not checked, and must stay zero.
@@ -223,8 +230,10 @@ def world_spheres(
         ),
         self_margin=jnp.float32(0.0),
         num_held=(len(outer.radius), len(held.radius)),
-        narrow_phase=narrow_phase(robot, len(collision[2]), len(radius), num_rows, begin),
+        narrow_phase=None,
     )
+    looked_at = narrow_phase(robot, len(collision[2]), len(radius), num_rows, begin)
+    spheres = spheres.with_narrow_phase(looked_at)
     return spheres.among(attached, names) if attached else spheres
 
 
