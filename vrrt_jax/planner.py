@@ -20,7 +20,7 @@ from vrrt_jax.core.types import ExpansionPolicy, Goal
 from vrrt_jax.joint import plan_to_goal
 from vrrt_jax.outcome import Progress
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.world import World
+from vrrt_jax.scene.world import World, rooms
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera
 from vrrt_jax.visual.end_picture import EndPicture
@@ -123,7 +123,9 @@ def plan(
         roots = np.stack([start, checks.check_limits(robot, q_guess, "guess")])
     if isinstance(problem, ConfigurationGoal):
         return plan_to_goal(robot, world, problem, policy, start, key, config, on_progress)
-    result = plan_by_loss(robot, world, problem, policy, roots, key, config, on_progress)
+    # Images do not tell poses to the millimeter: spheres do, where the start allows.
+    room = rooms(world, start[None], margin=0.0)[0]
+    result = plan_by_loss(robot, room, problem, policy, roots, key, config, on_progress)
     return drawn(result, goal, robot)
 
 
