@@ -44,7 +44,7 @@ class Verification:
     checked: int  # number of configurations checked
     contact: str | None  # the first violation, such as "link5 touches box_2 at 37 % of the path"
     clearance: float = float("nan")  # smallest distance to obstacles, where it is measured [m]
-    geometry: str = "primitives"  # what the robot was made of, or "meshes", or "spheres"
+    geometry: str = "primitives"  # or "meshes", "polytopes", "spheres": of what the robot was
 
 
 class Drawing(Protocol):

@@ -18,7 +18,7 @@ from vrrt_jax.robots.xml_file import check_mjcf
 COLLISION_GEOM = {"group": "3", "contype": "0", "conaffinity": "1"}
 SELF_COLLISION_GEOM = {"group": "4", "contype": "2", "conaffinity": "2"}
 # Polytopes touch nothing in this model: they are for a second look at what spheres touch.
-POLYTOPE_GEOM = {"group": "5", "contype": "8", "conaffinity": "8"}
+POLYTOPE_GEOM = {"group": "5", "contype": "8", "conaffinity": "0"}
 # The names of the kinds in the text: packaged files carry them.
 _CLASSES = (("cover", COLLISION_GEOM), ("thin", SELF_COLLISION_GEOM))
 _POLYTOPE = "polytope"

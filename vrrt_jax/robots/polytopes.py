@@ -16,6 +16,7 @@ _TOLERANCE = 2e-3  # [m] that a polytope may stick out, if it takes no more plan
 _MAX_PARTS = 4  # of a body
 _ROUNDING = 2e-5  # [m] what is lost in writing and reading
 _SAME_FACE = 1e-3  # normals of faces of one plane differ by no more
+_SLIVER = 1e-5  # of the surface: a smaller face comes from rounding, and is left out
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -110,7 +111,8 @@ def faces(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     )
     # Triangles of one face have nearly the same normal: the largest stands for all.
     normals: list[np.ndarray] = []
-    for normal in hull.equations[np.argsort(-area), :3]:
+    order = np.argsort(-area)
+    for normal in hull.equations[order[area[order] > _SLIVER * area.sum()], :3]:
         if all(normal @ other < 1 - _SAME_FACE for other in normals):
             normals.append(normal)
     found = np.array(normals)
@@ -130,7 +132,7 @@ def read_polytopes(model: mujoco.MjModel) -> dict[int, list[np.ndarray]]:
         mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
         vertices = np.float64(model.mesh_vert[first : first + model.mesh_vertnum[mesh]])
         vertices = vertices @ rotation.reshape(3, 3).T + model.geom_pos[geom]
-        found.setdefault(int(model.geom_bodyid[geom]), []).append(vertices)
+        found.setdefault(int(model.geom_bodyid[geom]), []).append(np.round(vertices, 5))
     return found
 
 

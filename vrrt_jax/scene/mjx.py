@@ -30,7 +30,6 @@ from vrrt_jax.robots.kinematics import link_poses, place
 from vrrt_jax.scene.batch_last import Value, evaluate
 from vrrt_jax.scene.flat_program import FlatProgram, flat_program
 from vrrt_jax.scene.held import HeldObject
-from vrrt_jax.scene.narrow_phase import SLACK
 from vrrt_jax.scene.obstacle_kinds import KINDS
 from vrrt_jax.scene.obstacles import PARKED, Obstacle, Obstacles, signed_distances, to_slots
 from vrrt_jax.scene.rows import least, over_rows
@@ -100,7 +99,9 @@ class MjxWorld(World):
             clearance = jnp.append(clearance, held)
         gaps = self.spheres.gaps(inner)
         span = self.spheres.free_span(clearance, gaps, edge)
-        span = jnp.where(is_free, jnp.maximum(span, 0.0), -1.0)
+        if self.spheres.narrow_phase is None:  # which also looks at what nearly touches
+            span = jnp.maximum(span, 0.0)
+        span = jnp.where(is_free, span, -1.0)
         return self.spheres.look_again(
             self.obstacles, self.margin, poses, edge, clearance, gaps, span
         )[0]
@@ -117,9 +118,7 @@ class MjxWorld(World):
             () bool; distances (n,) of the robot's collision spheres to obstacles, less the margin
             [m]; poses (L, 3, 4) of links.
         """
-        between = self.spheres.self_margin
-        between += 0.0 if self.spheres.narrow_phase is None else SLACK
-        inputs = jax.lax.stop_gradient((self.geoms, self.margin, between, q))
+        inputs = jax.lax.stop_gradient((self.geoms, self.margin, self.spheres.self_margin, q))
         *common, q = inputs
         return jax.tree.map(lambda part: part[0], self.scene.answers(tuple(common), q[None]))
 

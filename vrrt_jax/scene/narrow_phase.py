@@ -13,14 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrrt_jax.core.types import pytree
-from vrrt_jax.robots.kinematics import place
+from vrrt_jax.robots.kinematics import lever_arms, place
 from vrrt_jax.scene.body_polytopes import BodyPolytopes, body_polytopes, bulges
 from vrrt_jax.scene.obstacles import signed_distances
 from vrrt_jax.scene.rows import least, over_rows
 
 # Self-collision spheres are no cover: they miss touches of up to 24 mm, in 0.1 % of configurations.
-# Nearer than this they count as touching where polytopes look again [m].
+# Nearer than this they count as touching where polytopes look again [m], but between bodies with
+# few joints between them: these are always near, and the spheres were fitted to just that.
 SLACK = 0.01
+_FEW_JOINTS = 2
 
 
 @pytree
@@ -32,6 +34,8 @@ class NarrowPhase:
 
     polytopes: BodyPolytopes  # of P bodies
     body: jax.Array  # (n,) i32 that each collision sphere covers
+    # How far points of a body move at most while one joint moves by one; 0 if it carries it not.
+    lever_arms: jax.Array  # (D, P) [m/rad] or [m/m]
     bulge: jax.Array  # (n,) what is deeper in a sphere touches the polytope [m]
     pair_bulge: jax.Array  # (a, b) likewise of two self-collision spheres [m]
     slack: jax.Array  # (a, b) what is in the contact distances for a second look [m]
@@ -63,6 +67,8 @@ def look_again(common: Any, rows: Any) -> tuple[jax.Array, jax.Array]:
     """
     spheres, obstacles, margin = common
     poses, edge, *start = rows
+    if not len(edge):
+        return start[0], start[1]
 
     # One after another: each takes as long as it needs, which no batch could.
     def look(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
@@ -87,39 +93,55 @@ def _look(
     outer, inner = place(spheres.collision, poses), place(spheres.self_collision, poses)
     columns = inner[:, inner.shape[1] - spheres.contact_distance.shape[1] :]
 
-    def at_obstacle(apart: "_Nearest", gaps: "_Nearest") -> "_State":
-        slot, sphere = apart.place
+    def at_obstacle(state: "_State") -> "_State":
+        slot, sphere = state.apart.place
         body = phase.body[sphere]
         gap = phase.polytopes.obstacle_gap(body, outer[:, sphere], poses, obstacles, slot) - margin
-        is_pair = (jnp.arange(len(apart.distances)) == slot)[:, None] & (phase.body == body)
-        return apart.at_least(gap, is_pair), gaps, gap > 0
+        is_pair = (jnp.arange(len(obstacles.rounding)) == slot)[:, None] & (phase.body == body)
+        speed = jnp.abs(edge) @ phase.lever_arms[:, body]
+        return _State(
+            apart=state.apart.at_least(gap, is_pair),
+            gaps=state.gaps,
+            span=jnp.minimum(state.span, gap / (speed + 1e-9)),
+            is_apart=gap > 0,
+        )
 
-    def at_bodies(apart: "_Nearest", gaps: "_Nearest") -> "_State":
-        row, column = gaps.place
+    def at_bodies(state: "_State") -> "_State":
+        row, column = state.gaps.place
         first, second = phase.first_body[row], phase.second_body[column]
         points = inner[:, row], columns[:, column]
         gap = phase.polytopes.body_gap(first, second, points, poses) - spheres.self_margin
         is_pair = (phase.first_body == first)[:, None] & (phase.second_body == second)
-        return apart, gaps.at_least(gap, is_pair), gap >= 0
+        # Joints that carry both bodies leave their distance as it is.
+        one, other = phase.lever_arms[:, first], phase.lever_arms[:, second]
+        speed = jnp.abs(edge) @ jnp.where((one > 0) != (other > 0), one + other, 0.0)
+        return _State(
+            apart=state.apart,
+            gaps=state.gaps.at_least(gap, is_pair),
+            span=jnp.minimum(state.span, gap / (speed + 1e-9)),
+            is_apart=gap >= 0,
+        )
 
     def is_open(state: "_State") -> jax.Array:
-        apart, gaps, is_apart = state
-        return is_apart & ((apart.least <= 0) | (gaps.least < 0))
+        return state.is_apart & ((state.apart.least <= 0) | (state.gaps.least < 0))
 
     def look(state: "_State") -> "_State":
-        apart, gaps, _ = state
-        return jax.lax.cond(apart.least <= 0, at_obstacle, at_bodies, apart, gaps)
+        return jax.lax.cond(state.apart.least <= 0, at_obstacle, at_bodies, state)
 
     # The deepest pair first, until one cannot be told apart.
-    apart = _nearest(signed_distances(obstacles, outer) - spheres.needed(margin))
-    start = apart, _nearest(spheres.gaps(inner)), jnp.array(True)
-    apart, gaps, is_apart = jax.lax.while_loop(is_open, look, start)
+    start = _State(
+        apart=_nearest(signed_distances(obstacles, outer) - spheres.needed(margin)),
+        gaps=_nearest(spheres.gaps(inner)),
+        span=jnp.float32(jnp.inf),
+        is_apart=jnp.array(True),
+    )
+    found = jax.lax.while_loop(is_open, look, start)
     span = jax.lax.cond(
-        is_apart,
-        lambda: spheres.free_span(least(apart.distances), gaps.distances, edge),
+        found.is_apart,
+        lambda: spheres.free_span(least(found.apart.distances), found.gaps.distances, edge),
         lambda: jnp.float32(-1.0),
     )
-    return span, apart.least
+    return jnp.minimum(span, found.span), found.apart.least
 
 
 @pytree
@@ -146,8 +168,14 @@ def _nearest(distances: jax.Array) -> _Nearest:
     return _Nearest(distances=distances, least=distances[place], place=place)
 
 
-# Distances to obstacles, between bodies, and whether all that was looked at is apart, () bool.
-_State = tuple[_Nearest, _Nearest, jax.Array]
+@pytree
+class _State:
+    """What is known of a configuration so far."""
+
+    apart: _Nearest  # (K, n) of obstacles and collision spheres
+    gaps: _Nearest  # (a, b) of self-collision spheres
+    span: jax.Array  # () share of the edge that bodies that were looked at are free along
+    is_apart: jax.Array  # () bool, whether all of these are
 
 
 def narrow_phase(
@@ -177,10 +205,14 @@ def narrow_phase(
     self_bulge[: len(others)] = bulges(robot.polytopes, others, robot.self_collision_spheres)
     pairs = self_bulge[:num_rows, None] + self_bulge[begin:]
     first, second = bodies(others, num_self)[:num_rows], bodies(others, num_self)[begin:]
-    have = (first < len(names))[:, None] & (second < len(names))
-    slack = np.where(have, SLACK, 0.0)
+    links = np.asarray(polytopes.link)
+    carriers = _carriers(robot.chain.parents)[links]
+    # Bodies without polytopes, the last row and column, need none.
+    many = np.pad((carriers[:, None] != carriers).sum(axis=-1) > _FEW_JOINTS, (0, 1))
+    slack = np.where(many[first[:, None], second], SLACK, 0.0)
     return NarrowPhase(
         polytopes=polytopes,
+        lever_arms=jnp.asarray(_lever_arms(robot, names) * carriers.T, jnp.float32),
         body=jnp.asarray(bodies(robot.collision_sphere_bodies, num)),
         bulge=jnp.asarray(bulge, jnp.float32),
         pair_bulge=jnp.asarray(pairs + slack, jnp.float32),
@@ -188,3 +220,26 @@ def narrow_phase(
         first_body=jnp.asarray(first),
         second_body=jnp.asarray(second),
     )
+
+
+def _carriers(parents: Sequence[int]) -> np.ndarray:
+    """Which of D joints carry each of the L links, (L, D) bool."""
+    carriers = np.zeros((len(parents) + 1, len(parents)), bool)
+    for joint, parent in enumerate(parents):  # parents come before their children
+        carriers[joint + 1] = carriers[parent]
+        carriers[joint + 1, joint] = True
+    return carriers
+
+
+def _lever_arms(robot: Any, names: Sequence[str]) -> np.ndarray:
+    """How far points of bodies move at most while one joint moves by one, (D, P)."""
+    arms = np.zeros((robot.num_joints, len(names)))
+    for polytope in robot.polytopes:
+        middle = polytope.vertices.mean(axis=0)
+        radius = np.linalg.norm(polytope.vertices - middle, axis=1).max()
+        link = np.array([polytope.link])
+        own = lever_arms(robot.chain, link, middle[None], robot.lower, robot.upper)[:, 0]
+        own += radius * robot.chain.is_hinge
+        body = names.index(polytope.body)
+        arms[:, body] = np.maximum(arms[:, body], own)
+    return arms

@@ -47,8 +47,9 @@ def verify_path(
             (Euclidean over joints). Whatever it is, two bodies approach each other between two
             checks by no more than their distance, or by 0.5 mm if they are nearer. So no contact
             deeper than 0.25 mm is missed, however long the arm, however thin the obstacle.
-        geometry: "meshes" for the true collision geometry, "spheres" for the robot's covering
-            spheres, "auto" for meshes where this machine has them.
+        geometry: "meshes" for the true collision geometry; "polytopes" for those that contain it,
+            or spheres for a robot that has none; "spheres" for the robot's covering spheres;
+            "auto" for meshes where this machine has them, else polytopes.
         measure_clearance: also measure the smallest distance to obstacles, which takes many times
             as long.
 

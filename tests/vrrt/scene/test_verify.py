@@ -8,14 +8,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from vrrt_jax.robots import load_robot, mesh_sources
+from vrrt_jax.robots import load_robot, mesh_sources, mjcf_writer
 from vrrt_jax.scene import exact
 from vrrt_jax.scene.exact import exact_scene
 from vrrt_jax.scene.obstacle_kinds import KINDS
 from vrrt_jax.scene.obstacles import Obstacle
 from vrrt_jax.scene.verify import contacts, interpolate, verify_path
 
-GEOMETRIES = ("meshes", "spheres")
+GEOMETRIES = ("meshes", "polytopes", "spheres")
 
 PENDULUM = """
 <mujoco>
@@ -120,23 +120,23 @@ def test_single_way_point_is_checked(panda, geometry):
     assert result.ok and result.checked == 1
 
 
-def test_meshes_and_spheres_agree_on_clearance(panda):
+def test_meshes_and_covers_agree_on_clearance(panda):
     if mesh_sources.mesh_file(panda.mesh_source) is None:
         pytest.skip("the Panda's meshes are not installed (mujoco-menagerie or genesis-world)")
     path = swing(panda, -1, 1)
-    exact, covered = (
+    exact, tight, covered = (
         verify_path(panda, [FLOOR, FAR], path, geometry=kind, measure_clearance=True).clearance
         for kind in GEOMETRIES
     )
-    assert covered <= exact + 1e-4  # spheres contain the meshes
-    assert covered > exact - 0.05
+    assert covered <= exact + 1e-4 and tight <= exact + 1e-4  # both contain the meshes
+    assert covered > exact - 0.05 and tight > exact - 0.01
 
 
-def test_auto_takes_spheres_without_meshes(panda, monkeypatch):
+def test_auto_takes_polytopes_without_meshes(panda, monkeypatch):
     monkeypatch.setenv("MENAGERIE_ROOT", "")
     monkeypatch.setattr(mesh_sources.importlib.util, "find_spec", lambda name: None)
     exact.forget()  # or the model of another test would be found there
-    assert verify_path(panda, [FAR], panda.home[None]).geometry == "spheres"
+    assert verify_path(panda, [FAR], panda.home[None]).geometry == "polytopes"
     with pytest.raises(ValueError, match="meshes of robot 'panda' are not on this machine"):
         verify_path(panda, [FAR], panda.home[None], geometry="meshes")
     exact.forget()
@@ -177,12 +177,12 @@ def test_no_setting_of_a_file_hides_a_contact(tmp_path, old, new):
         assert not result.ok and "post" in str(result.contact), kind
 
 
-def test_a_robot_whose_file_has_moved_is_checked_by_its_spheres(tmp_path):
+def test_a_robot_whose_file_has_moved_is_checked_by_its_polytopes(tmp_path):
     (tmp_path / "arm.xml").write_text(PENDULUM)
     robot = load_robot(tmp_path / "arm.xml")
     (tmp_path / "arm.xml").unlink()
     result = verify_path(robot, [FAR], np.array([[0.1], [0.2]]))
-    assert result.ok and result.geometry == "spheres"
+    assert result.ok and result.geometry == "polytopes"
 
 
 def test_files_own_geometry_is_the_truth(pendulum):
@@ -229,9 +229,14 @@ def random_obstacles(rng, num):
 def test_obstacles_moved_into_slots_are_those_of_a_model_of_their_own(panda, geometry, rng):
     scenes = [list(random_obstacles(rng, num)) for num in (10, 3, 7)]
     moved = [exact_scene(panda, obstacles, geometry=geometry) for obstacles in scenes]
-    spheres = mujoco.MjSpec.from_string(panda.xml)
+    bits = 1 if geometry == "spheres" else exact.ALL_BITS
     for scene, obstacles in zip(moved, scenes, strict=True):
-        spec = mesh_sources.mesh_spec(panda, visuals=False) if geometry == "meshes" else spheres
+        spec = mujoco.MjSpec.from_string(panda.xml)
+        if mjcf_writer.keep_geoms(spec, polytopes=geometry == "polytopes"):
+            for geom in spec.geoms:
+                geom.contype = geom.conaffinity = bits
+        if geometry == "meshes":
+            spec = mesh_sources.mesh_spec(panda, visuals=False)
         for k, obstacle in enumerate(obstacles):
             spec.worldbody.add_geom(
                 name=f"own {k}",
@@ -239,8 +244,8 @@ def test_obstacles_moved_into_slots_are_those_of_a_model_of_their_own(panda, geo
                 size=KINDS[obstacle.kind].geom_size(obstacle.size),
                 pos=obstacle.position,
                 quat=obstacle.quaternion,
-                contype=exact.ALL_BITS if geometry == "meshes" else 1,
-                conaffinity=exact.ALL_BITS if geometry == "meshes" else 1,
+                contype=bits,
+                conaffinity=bits,
             )
         model = spec.compile()
         data = mujoco.MjData(model)
@@ -255,8 +260,6 @@ def test_obstacles_moved_into_slots_are_those_of_a_model_of_their_own(panda, geo
             words = [scene.describe(pair) for pair in scene.touching(q)]
             names = {w.split(" touches ")[1] for w in words}
             assert seen == names & set(own.values())
-        if geometry == "spheres":
-            spheres = mujoco.MjSpec.from_string(panda.xml)
 
 
 def test_what_is_skipped_is_free(panda, geometry, rng):
@@ -320,7 +323,11 @@ def test_typical_path_is_verified_in_time(panda):
         (np.zeros((0, 7)), {}, r"shape \(0, 7\)"),
         (np.full((2, 7), np.nan), {}, "waypoint 0 of the path is not finite"),
         (np.zeros((2, 7)), {"step": 0.0}, "step is 0.0; expected a positive"),
-        (np.zeros((2, 7)), {"geometry": "mesh"}, "expected one of: auto, meshes, spheres"),
+        (
+            np.zeros((2, 7)),
+            {"geometry": "mesh"},
+            "one of: auto, meshes, polytopes, spheres",
+        ),
     ],
 )
 def test_bad_arguments(panda, path, arguments, message):
