@@ -35,6 +35,7 @@ class ModelConfig:
     lookup: bool = True
     latent: int = 8  # dimensions of the CVAE's latent; of NEXT, features of each of its channels
     kl_weight: float = 0.01  # of the CVAE's KL term
+    blocked_weight: float = 0.0  # of the term that keeps the CVAE's waypoints clear of obstacles
     attention: int = 8  # channels that NEXT attends to
     iterations: int = 20  # of the module with which NEXT plans on the map
     turning: int = 0  # joints whose turns to the goal NEXT sees, those with cosines and sines
