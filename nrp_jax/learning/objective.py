@@ -60,7 +60,7 @@ def loss_fn(
         z = jax.random.normal(
             jax.random.fold_in(key, 1), (len(batch.start), LATENTS, config.latent)
         )
-        made = module.apply(
+        made: Any = module.apply(
             variables, batch.image, batch.start, batch.goal, z, method=models.CVAE.decode
         )
         share = jnp.mean(blocked_share(config, robot, batch.image, batch.start, made))

@@ -1,6 +1,7 @@
 """The term that keeps a CVAE's waypoints clear of obstacles."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from nrp_synthetic import synthetic_rows
 
 from nrp_jax import load_robot
 from nrp_jax.learning import features
-from nrp_jax.learning.batches import make_batch, make_examples
+from nrp_jax.learning.batches import describe, make_batch, make_examples
 from nrp_jax.learning.checkpoint import build_module
 from nrp_jax.learning.models import CVAE, ModelConfig
 from nrp_jax.learning.objective import CLEARANCE, blocked_share
@@ -22,10 +23,9 @@ pytestmark = pytest.mark.light_compilation
 
 
 def described(config, robot, q):
-    """Features (n, E) of local configurations (n, D)."""
+    """Features (n, E) and link frames (n, F, 3) of local configurations (n, D)."""
     points = batch_link_features(robot, jnp.asarray(q))
-    one = lambda q, points: features.configuration_features(config, robot, q, points)
-    return jax.vmap(one)(jnp.asarray(q), points), points
+    return describe(config, robot, jnp.asarray(q)[None], points[None])[0], points
 
 
 @pytest.mark.parametrize("make", [ModelConfig.default, ModelConfig.published])
@@ -61,7 +61,10 @@ def test_a_way_is_blocked_by_how_much_of_it_is_near_obstacles():
     q = np.zeros((4, 8), np.float32)
     q[1:, 0] = 0.5, 1.1, 1.8
     made, _ = described(config, robot, q)
-    share = lambda made: blocked_share(config, robot, image, made[:1], made[None, 1:])[0]
+
+    def share(made):
+        return blocked_share(config, robot, image, made[:1], made[None, 1:])[0]
+
     before, at, behind = np.asarray(share(made))
     # The arm is straight along the wall, so that all seven points of the snake have one x.
     passed = np.arange(1, 9) / 8 * 1.8
@@ -81,13 +84,13 @@ def test_a_cvae_that_is_trained_so_generates_waypoints_that_are_blocked_less(tmp
         config = ModelConfig.default("snake", "cvae")
         config = dataclasses.replace(config, blocked_weight=weight, **small)
         examples = make_examples(config, robot, grids, columns, target=ones, weight=ones)
-        settings = TrainConfig(epochs=10, batch=48, learning_rate=8e-3)
+        settings = TrainConfig(epochs=8, batch=48, learning_rate=8e-3)
         out = tmp_path / str(weight)
         model = train(config, robot, examples, out, settings=settings, progress=False)
         queries = np.flatnonzero(np.asarray(examples.home) == 0)
         batch = jax.jit(make_batch, static_argnums=0)(config, robot, examples, queries)
         z = jax.random.normal(jax.random.key(5), (len(queries), 16, config.latent))
-        module = build_module(config, model.info["num_outputs"])
+        module: Any = build_module(config, model.info["num_outputs"])
         seen = (batch.image, batch.start, batch.goal, z)
         made = module.apply(model.variables, *seen, method=CVAE.decode)
         share = blocked_share(config, robot, batch.image, batch.start, made)
