@@ -7,6 +7,7 @@ Letters: ``B`` lanes, ``C`` latents of a lane, ``D`` joints.
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from nrp_jax.learning import features
 from nrp_jax.learning.checkpoint import build_module
@@ -46,7 +47,7 @@ class Generator(PytreeSubclasses):
 class CVAESampler(Generator):
     """NRP-g: the CVAE's decoder makes waypoints of random latents."""
 
-    # So many waypoints are made, and their edges checked; the first that is free is taken.
+    # So many waypoints are made, and their edges checked; the longest that is free is taken.
     num_edge_checked: int = static(default=8)
     edge_checks: int = static(default=12)  # configurations checked along each of these edges
 
@@ -61,6 +62,9 @@ class CVAESampler(Generator):
     ) -> tuple[jax.Array, jax.Array]:
         """Waypoints as :meth:`propose` makes them, and how many configurations it checked."""
         q = self.generate(world, q_from, q_goal, self.num_edge_checked, key)
+        if self.num_edge_checked > 1:
+            length = world.length(world.edge(jnp.broadcast_to(q_from[:, None], q.shape), q))
+            q = jnp.take_along_axis(q, jnp.argsort(-length, axis=1)[..., None], axis=1)
         return first_free(world, q_from, q, self.edge_checks)
 
 

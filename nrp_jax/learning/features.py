@@ -96,6 +96,16 @@ def to_configuration(config: ModelConfig, robot: MobileRobot, features: jax.Arra
     return jnp.concatenate([linear, jnp.arctan2(sine, cosine)], axis=-1)[..., order]
 
 
+def generated_points(config: ModelConfig, robot: MobileRobot, features: jax.Array) -> jax.Array:
+    """Link frames (..., F, 3) that generated features (..., E) end with [m]; planar ones at z = 0.
+
+    They need not be exactly those of the joints that the features begin with.
+    """
+    num = len(robot.joint_names) + (0 if config.paper else sum(robot.angular))
+    points = features[..., num:].reshape(*features.shape[:-1], -1, 2 if robot.planar else 3)
+    return jnp.pad(points, [(0, 0)] * (points.ndim - 1) + [(0, 3 - points.shape[-1])])
+
+
 def standing_points(robot: MobileRobot, q: jax.Array, points: jax.Array) -> jax.Array:
     """Points (P, 3) of the robot in a local configuration (D,): link frames (F, 3) and base [m]."""
     heights = jnp.array([0.0] if robot.planar else [0.1, 0.5, 0.9])
@@ -103,8 +113,8 @@ def standing_points(robot: MobileRobot, q: jax.Array, points: jax.Array) -> jax.
     return jnp.concatenate([points, base])
 
 
-def passed_points(start: jax.Array, end: jax.Array) -> jax.Array:
-    """Points (PATH_SAMPLES * P, 3) that the robot passes on its path from one place to another [m].
+def passed_points(start: jax.Array, end: jax.Array, samples: int = PATH_SAMPLES) -> jax.Array:
+    """Points (samples * P, 3) that the robot passes on its path from one place to another [m].
 
     Straight lines stand in for the true paths, which are nearly straight where the posture changes
     little.
@@ -112,8 +122,9 @@ def passed_points(start: jax.Array, end: jax.Array) -> jax.Array:
     Args:
         start: (P, 3) points of the robot at the start.
         end: (P, 3) the same points at the end.
+        samples: places on the way, the end among them.
     """
-    fraction = jnp.arange(1, PATH_SAMPLES + 1)[:, None, None] / PATH_SAMPLES
+    fraction = jnp.arange(1, samples + 1)[:, None, None] / samples
     return (start + fraction * (end - start)).reshape(-1, 3)
 
 
@@ -125,6 +136,18 @@ def cells(points: jax.Array, shape: tuple[int, ...], resolution: float) -> jax.A
             index = jnp.floor(points[..., axis] * (1.0 / resolution)).astype(jnp.int32) + middle
             flat = flat * shape[axis] + jnp.clip(index, 0, shape[axis] - 1)
     return flat
+
+
+def interpolate(image: jax.Array, points: jax.Array, resolution: float) -> jax.Array:
+    """What an image (X, Y, Z) holds at local points (..., 3) [m], between the centers of its cells.
+
+    Unlike what the cells themselves hold, this tells which way it rises.
+    """
+    middle = (image.shape[0] / 2, image.shape[1] / 2, 0.0)
+    axes = [axis for axis in range(3) if image.shape[axis] > 1]
+    place = [points[..., axis] / resolution + middle[axis] - 0.5 for axis in axes]
+    image = image.reshape([image.shape[axis] for axis in axes])
+    return jax.scipy.ndimage.map_coordinates(image, place, order=1, mode="nearest")
 
 
 def steps(robot: MobileRobot, q: jax.Array, end: jax.Array) -> jax.Array:

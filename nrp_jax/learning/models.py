@@ -35,6 +35,7 @@ class ModelConfig:
     lookup: bool = True
     latent: int = 8  # dimensions of the CVAE's latent; of NEXT, features of each of its channels
     kl_weight: float = 0.01  # of the CVAE's KL term
+    blocked_weight: float = 0.0  # of the term that keeps the CVAE's waypoints clear of obstacles
     attention: int = 8  # channels that NEXT attends to
     iterations: int = 20  # of the module with which NEXT plans on the map
     turning: int = 0  # joints whose turns to the goal NEXT sees, those with cosines and sines
@@ -55,6 +56,8 @@ class ModelConfig:
             wide["channels"] = (32, 64, 96)
         if kind == "cvae":
             wide |= {"context": 384, "width": 384}
+            # Measured for the snake's windows alone.
+            wide["blocked_weight"] = 0.5 if (task, scope) == ("snake", "window") else 0.0
         if kind == GLOBAL_CVAE:
             wide |= {"context": 256, "width": 256}
         return cls(task=task, kind=kind, scope=scope, **wide)

@@ -5,13 +5,19 @@ from typing import Any
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
-from nrp_jax.learning import models
+from nrp_jax.homes.grid import RESOLUTION
+from nrp_jax.learning import features, models
 from nrp_jax.learning.batches import Batch, Examples, make_batch
 from nrp_jax.learning.models import ModelConfig
 from nrp_jax.scene.robots import MobileRobot
+
+LATENTS = 8  # random ones of a query, the ways to whose waypoints are looked at
+WAY_SAMPLES = 8  # places on each of these ways
+CLEARANCE = 0.1  # distance to obstacles from which on a place is clear [m]
 
 
 def init(config: ModelConfig, module: nn.Module, batch: Batch, key: jax.Array) -> dict[str, Any]:
@@ -22,6 +28,7 @@ def init(config: ModelConfig, module: nn.Module, batch: Batch, key: jax.Array) -
 
 def loss_fn(
     config: ModelConfig,
+    robot: MobileRobot,
     module: nn.Module,
     variables: dict[str, Any],
     batch: Batch,
@@ -32,6 +39,7 @@ def loss_fn(
 
     Args:
         config: of the model.
+        robot: whose configurations they are.
         module: from :func:`nrp_jax.learning.checkpoint.build_module`.
         variables: of the module.
         batch: of n queries.
@@ -48,13 +56,51 @@ def loss_fn(
     if config.kind == "discriminator":
         return models.discriminator_loss(outputs, batch.target, batch.weight), (outputs, changed)
     loss, error, _ = models.cvae_loss(config, batch.waypoints, *outputs, mask=batch.weight)
+    if config.blocked_weight:
+        z = jax.random.normal(
+            jax.random.fold_in(key, 1), (len(batch.start), LATENTS, config.latent)
+        )
+        made: Any = module.apply(
+            variables, batch.image, batch.start, batch.goal, z, method=models.CVAE.decode
+        )
+        share = jnp.mean(blocked_share(config, robot, batch.image, batch.start, made))
+        loss = loss + config.blocked_weight * share
     return loss, (error, changed)
+
+
+def blocked_share(
+    config: ModelConfig, robot: MobileRobot, image: jax.Array, start: jax.Array, made: jax.Array
+) -> jax.Array:
+    """How much of the ways from starts to generated waypoints obstacles block (n, C), 0 to 1.
+
+    A place on a way counts as 0 if nothing is within ``CLEARANCE``, as 1 inside of obstacles, and
+    else between. The gradient moves waypoints to where they can be reached. A CVAE that only
+    repeats good waypoints does not learn that of what it generates between them.
+
+    Args:
+        config: of the CVAE.
+        robot: whose configurations they are.
+        image: (n, X, Y, Z) distances to obstacles around the starts [m].
+        start: (n, E) features.
+        made: (n, C, E) features of waypoints.
+    """
+
+    def one(image: jax.Array, start: jax.Array, made: jax.Array) -> jax.Array:
+        # Features begin with the place of the base.
+        begin, end = (
+            features.standing_points(robot, q, features.generated_points(config, robot, q))
+            for q in (start, made)
+        )
+        passed = features.passed_points(begin, end, WAY_SAMPLES)
+        return jnp.mean(nn.relu(1.0 - features.interpolate(image, passed, RESOLUTION) / CLEARANCE))
+
+    return jax.vmap(jax.vmap(one, (None, None, 0)))(image, start, made)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _evaluate(config, module, robot, variables, examples, chosen, key):
     batch = make_batch(config, robot, examples, chosen)
-    loss, (outputs, _) = loss_fn(config, module, variables, batch, key)
+    loss, (outputs, _) = loss_fn(config, robot, module, variables, batch, key)
     return loss, outputs, batch.target, batch.weight
 
 

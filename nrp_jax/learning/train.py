@@ -127,7 +127,7 @@ def _make_update(
 
         def objective(params):
             variables = {**state.variables, "params": params}
-            return loss_fn(config, module, variables, batch, key, train=True)
+            return loss_fn(config, robot, module, variables, batch, key, train=True)
 
         (loss, (_, changed)), gradient = jax.value_and_grad(objective, has_aux=True)(
             state.variables["params"]

@@ -82,6 +82,22 @@ def test_checking_finds_waypoints_that_can_be_reached(models, world, ends):
     assert reached(24) > reached(1) + 0.2
 
 
+def test_nrp_g_takes_the_farthest_waypoint_that_can_be_reached(world, ends):
+    """The farthest of all, where none can."""
+    sampler = samplers.load_sampler("snake", "cvae")
+    key, q_from = jax.random.key(4), np.asarray(ends[0])
+    q = np.asarray(jax.jit(sampler.generate, static_argnums=3)(world, *ends, 8, key))
+    edge = np.asarray(world.edge(jnp.broadcast_to(ends[0][:, None], q.shape), q))
+    fraction = np.arange(1, 13)[:, None, None, None] / 12
+    along = q_from[:, None] + fraction * edge
+    ok = free(world, along.reshape(-1, 8)).reshape(12, 32, 8).all(axis=0)
+    length = np.linalg.norm(edge[..., :2], axis=-1) + 0.167 * np.linalg.norm(edge[..., 2:], axis=-1)
+    best = np.argmax(length + 100 * ok, axis=1)
+    assert 0 < ok.mean() < 1 and len(np.unique(best)) > 4
+    found = samplers.propose(sampler, world, *ends, key)
+    np.testing.assert_allclose(found, q[np.arange(32), best], atol=1e-5)
+
+
 def test_a_goal_in_the_window_can_be_the_waypoint(models, world, ends):
     """Of no candidates but the goal, the goal is the best."""
     sampler = samplers.make_sampler(models["discriminator"], candidates=0)
