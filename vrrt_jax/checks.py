@@ -85,7 +85,8 @@ def check_start(robot: Robot, world: World, q: Any, what: str = "start") -> np.n
             f"this one, '{robot.name}', are at {dict(robot.frozen)}: build the world for it"
         )
     q = check_limits(robot, q, what)
-    if not bool(batch_is_free(world, q[None])):
+    # Spheres alone say it sooner: what they leave free needs no narrow phase, nor its compilation.
+    if not any(bool(batch_is_free(w, q[None])) for w in (world.by_spheres_alone(), world)):
         touching = (
             contacts(robot, world, q)
             or contacts(robot, world, q, geometry="polytopes")

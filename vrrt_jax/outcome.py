@@ -119,5 +119,8 @@ def finish(
         return dataclasses.replace(result, tree_share=chosen.tree_share)
     # Every fourth of the small steps, and the end: what the spheres do between is next to nothing.
     seldom = np.concatenate([result.trajectory[::4], result.trajectory[-1:]])
-    clearance = batch_clearance(world, padded(seldom, 512), len(seldom))
+    for room in (world.by_spheres_alone(), world):  # polytopes only where spheres touch
+        clearance = batch_clearance(room, padded(seldom, 512), len(seldom))
+        if clearance > 0:
+            break
     return dataclasses.replace(result, clearance=float(clearance), tree_share=chosen.tree_share)

@@ -1,6 +1,7 @@
 """Pose goals: inverse kinematics from many places at once, then one search to all that are free."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ from vrrt_jax.robots.bodies import moving_body
 from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.robots.robot import Robot
 from vrrt_jax.scene.verify import contacts
-from vrrt_jax.scene.world import World, batch_is_free, keeping_clearance
+from vrrt_jax.scene.world import World, batch_is_free, rooms
 from vrrt_jax.visual.distinct import distances_to, distinct
 
 REACHED_M = 1e-4  # a link this near to its pose is there
@@ -84,20 +85,20 @@ def inverse_kinematics(
 
 def _solutions(
     robot: Robot,
-    rooms: tuple[World, ...],
+    wary: Sequence[World],
     pose: np.ndarray,
     link: str | None,
     key: jax.Array,
     q_near: np.ndarray | None,
     num: int,
 ) -> np.ndarray:
-    """See :func:`inverse_kinematics`; of a round's solutions those free in the first of the rooms.
+    """See :func:`inverse_kinematics`; of a round's solutions those free in the first of the worlds.
 
     If there are none, those free in the second, and so on.
 
     Args:
         robot: whose kinematics it is.
-        rooms: worlds that differ in their margins, the most wanted first.
+        wary: worlds that differ in their margins, the most wanted first.
         pose: (4, 4) [m].
         link: a moving body, or None.
         key: random key.
@@ -105,7 +106,7 @@ def _solutions(
         num: at most so many.
     """
     check_loaded(robot, "the robot", "vrrt_jax.load_robot")
-    check_loaded(rooms[0], "the world", "vrrt_jax.build_world or vrrt_jax.load_world")
+    check_loaded(wary[0], "the world", "vrrt_jax.build_world or vrrt_jax.load_world")
     link = robot.link_names[-1] if link is None else link
     index, in_link = moving_body(robot, link)
     target = jnp.asarray(rigid(pose, "the pose") @ np.linalg.inv(in_link), jnp.float32)
@@ -113,13 +114,13 @@ def _solutions(
     nearest, least = q_near, np.inf
     reached = 0
     for k in range(ROUNDS):
-        places = _places(rooms[0], jnp.asarray(q_near), jax.random.fold_in(key, k), k == 0)
+        places = _places(wary[0], jnp.asarray(q_near), jax.random.fold_in(key, k), k == 0)
         q, meters, radians = (
-            np.asarray(a) for a in _descend(rooms[0], target, jnp.int32(index), places)
+            np.asarray(a) for a in _descend(wary[0], target, jnp.int32(index), places)
         )
         there = (meters <= REACHED_M) & (radians <= REACHED_RAD)
         reached += int(np.sum(there))
-        for room in rooms:
+        for room in wary:
             rows = np.flatnonzero(there & np.asarray(batch_is_free(room, q)))
             if len(rows):
                 rows = rows[np.argsort(distances_to(room, q[rows], q_near), kind="stable")]
@@ -131,8 +132,8 @@ def _solutions(
     if not reached:
         told = f"'{link}' stays {missed} from the pose; move it to where the arm reaches"
         raise Unreached(told, nearest)
-    touching = contacts(robot, rooms[-1], nearest) or contacts(
-        robot, rooms[-1], nearest, geometry="spheres"
+    touching = contacts(robot, wary[-1], nearest) or contacts(
+        robot, wary[-1], nearest, geometry="polytopes"
     )
     raise Unreached(
         f"all {reached} configurations that take '{link}' there are in collision, one of them: "
@@ -180,10 +181,9 @@ def plan_to_pose(
     policy = RRTConnect.for_world(world, lanes=config.tree.lanes)
     key_goals, key = jax.random.split(key)
     # Goals with room around them are better, if there are any.
-    wary = keeping_clearance(world, q_start[None], config.path.margin)
-    rooms = (world,) if wary is world else (wary, world)
+    wary = rooms(world, q_start[None], config.path.margin)
     try:
-        goals = _solutions(robot, rooms, pose, link, key_goals, q_start, GOALS)
+        goals = _solutions(robot, wary, pose, link, key_goals, q_start, GOALS)
     except Unreached as error:
         goal = ConfigurationGoal(q=jnp.asarray(q_start))
         tree = policy.init(world, goal, q_start[None], config.tree.capacity)

@@ -95,7 +95,7 @@ def free_pairs(
         distance: between the two [rad]; None draws both ends alike.
         q_start: (D,) the first of each pair [rad] or [m]; drawn if it is not given.
     """
-    listed = obstacle_list(world)
+    listed, alone = obstacle_list(world), world.by_spheres_alone()  # ends with some room
     for _ in range(MOST_DRAWS):
         starts = rng.uniform(robot.lower, robot.upper, (256, robot.num_joints))
         if q_start is not None:
@@ -108,7 +108,7 @@ def free_pairs(
         inside = robot.is_continuous | ((goals > robot.lower) & (goals < robot.upper))
         goals = np.asarray(enforce_bounds(world, jnp.asarray(goals, jnp.float32)))
         free = [
-            np.asarray(batch_is_free(world, jnp.asarray(q, jnp.float32))) for q in (starts, goals)
+            np.asarray(batch_is_free(alone, jnp.asarray(q, jnp.float32))) for q in (starts, goals)
         ]
         for i in np.flatnonzero(inside.all(1) & free[0] & free[1]):
             ends = starts[i].astype(np.float32), goals[i]

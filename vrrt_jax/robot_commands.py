@@ -125,19 +125,25 @@ def _spheres(arguments: argparse.Namespace) -> int:
         write_text(Path(arguments.out), text)
         print(f"wrote {arguments.out}")
         robot = load_robot(arguments.out)
-    measured = measure_spheres(robot, arguments.num, arguments.seed, scenes)
     covering, thin = robot.collision_spheres.radius, robot.self_collision_spheres.radius
-    print(f"{len(covering)} covering and {len(thin)} thin spheres")
-    for name, counts in (
-        ("against obstacles", measured.obstacles),
-        ("against itself", measured.self_collision),
-        ("in one count", measured.either),
-    ):
-        print(
-            f"{name}: {counts.misses} of {counts.colliding} collisions missed, "
-            f"{counts.false_alarms} false alarms in {counts.free} free configurations "
-            f"({100 * counts.false_alarm_rate:.2f} %)"
+    print(
+        f"{len(covering)} covering and {len(thin)} thin spheres, {len(robot.polytopes)} polytopes"
+    )
+    for polytopes in (False, True) if robot.polytopes else (False,):
+        measured = measure_spheres(
+            robot, arguments.num, arguments.seed, scenes, polytopes=polytopes
         )
+        print("spheres and polytopes:" if polytopes else "spheres alone:")
+        for name, counts in (
+            ("against obstacles", measured.obstacles),
+            ("against itself", measured.self_collision),
+            ("in one count", measured.either),
+        ):
+            print(
+                f"  {name}: {counts.misses} of {counts.colliding} collisions missed, "
+                f"{counts.false_alarms} false alarms in {counts.free} free configurations "
+                f"({100 * counts.false_alarm_rate:.2f} %)"
+            )
     return EXIT_SOLVED
 
 

@@ -20,7 +20,7 @@ from vrrt_jax.core.result import PlanResult
 from vrrt_jax.core.tree_file import Nodes, load_nodes, nodes_of
 from vrrt_jax.problems import load_problem, read_json
 from vrrt_jax.report import outcome
-from vrrt_jax.robots import Robot
+from vrrt_jax.robots import Robot, mjcf_writer
 from vrrt_jax.robots.kinematics import batch_link_poses
 from vrrt_jax.robots.mesh_sources import mesh_spec
 from vrrt_jax.scene.movable import MovableObstacles
@@ -36,7 +36,6 @@ PICTURES = 151  # along a path: five seconds of play
 PICTURE_PX = 240  # height of the goal image and of the end beside it
 MOST_EDGES = 2_000  # drawn of a tree: all of a large one would hide the robot
 EDGE_POINTS = 5  # along an edge, which is a curve in space
-_SURFACE_GROUP = 4  # of the spheres that follow the surface, in ``Robot.xml``
 _WAY, _PATH = (255, 150, 40), (214, 40, 57)
 # What the page tells of a result, in this order.
 _TOLD = (
@@ -188,11 +187,12 @@ def _offer_plans(
 
 
 def _model(world: World) -> tuple[mujoco.MjModel, tuple[int, ...]]:
-    """Robot and held objects, and the groups to draw: true meshes, or spheres."""
+    """Robot and held objects, and the groups to draw: true meshes, or what stands for them."""
     robot: Robot = world.robot.value
     spec, groups = mesh_spec(robot), VISUAL_GROUPS
     if spec is None:
-        spec, groups = mujoco.MjSpec.from_string(robot.xml), (_SURFACE_GROUP,)
+        kind = mjcf_writer.POLYTOPE_GEOM if robot.polytopes else mjcf_writer.SELF_COLLISION_GEOM
+        spec, groups = mujoco.MjSpec.from_string(robot.xml), (int(kind["group"]),)
     model = MeshRenderer(spec, [], world.attached).model
     return model, (*groups, OBSTACLE_GROUP)
 

@@ -58,8 +58,11 @@ class WorldSpheres:
         outer, inner = jax.lax.optimization_barrier(
             (place(self.collision, poses), place(self.self_collision, poses))
         )
-        clearance, gaps = self.clearances(obstacles, outer, margin), self.gaps(inner)
-        edge = jnp.zeros(self.lever_arms.shape[:1], poses.dtype)
+        clearance = self.clearances(obstacles, outer, margin)
+        if self.narrow_phase is None:
+            # A robot of few links may have no pair to check: then nothing can touch.
+            return jnp.all(clearance > 0) & jnp.all(least(self.squared_gaps(inner)) >= 0)
+        gaps, edge = self.gaps(inner), jnp.zeros(self.lever_arms.shape[:1], poses.dtype)
         span = jnp.where(_are_apart(clearance, gaps), 0.0, -1.0)
         return self.look_again(obstacles, margin, poses, edge, clearance, gaps, span)[0] >= 0
 

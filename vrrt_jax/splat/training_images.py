@@ -134,7 +134,7 @@ def read_images(file: Path) -> tuple[TrainingImages, np.ndarray]:
 
 def random_configurations(robot, num: int, rng: np.random.Generator) -> np.ndarray:
     """Configurations (num, D) inside the limits that do not touch themselves."""
-    world = build_world(robot, engine="closed_form")
+    world = build_world(robot, engine="closed_form").by_spheres_alone()
     found = np.zeros((0, len(robot.lower)))
     while len(found) < num:
         q = rng.uniform(robot.lower, robot.upper, (256, len(robot.lower)))
