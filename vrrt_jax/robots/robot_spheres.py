@@ -40,7 +40,8 @@ def spheres_of(model: mujoco.MjModel) -> RobotSpheres:
         ValueError: it has no collision geom, or one that spheres cannot be fitted to.
     """
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    collides &= ~mjcf_writer.is_polytope(model)  # of a file that `vrrt spheres` wrote
+    if np.any(_is_kind(model, np.arange(model.ngeom), mjcf_writer.COLLISION_GEOM)):
+        collides &= ~mjcf_writer.is_polytope(model)  # as `vrrt spheres` writes them
     geoms = np.flatnonzero(collides)
     if len(geoms) == 0:
         raise ValueError(

@@ -16,6 +16,8 @@ from vrrt_jax.robots.kinematics import Spheres
 from vrrt_jax.robots.polytopes import Polytope, faces
 from vrrt_jax.scene.obstacles import Obstacles
 
+_SAME = 1e-5  # [m] two points that are nearer to each other have no way between them
+
 
 @pytree
 class BodyPolytopes:
@@ -78,7 +80,8 @@ class BodyPolytopes:
         away = _from_box(
             obstacles.rotation[index].T @ (point - obstacles.position[index]), half, is_round
         )
-        gap = jnp.maximum(gap, jnp.min(_along(vertices, axes @ away), axis=0) - reach(*away))
+        beyond = jnp.min(_along(vertices, axes @ away), axis=0) - reach(*away)
+        gap = jnp.maximum(gap, jnp.where(jnp.any(away != 0), beyond, -jnp.inf))
         return self._least(body, jnp.where(self.has_part[body], gap, jnp.inf))
 
     def body_gap(
@@ -101,11 +104,12 @@ class BodyPolytopes:
             self._faces_to_vertices(first, second, poses),
             self._faces_to_vertices(second, first, poses).T,
         )
-        # The way from one point to the other.
+        # The way from one point to the other, if they differ.
         away = points[1] - points[0]
-        away /= jnp.linalg.norm(away) + 1e-9
+        length = jnp.linalg.norm(away)
+        away /= length + 1e-9
         far, near = -self._nearest(first, poses, -away), self._nearest(second, poses, away)
-        gap = jnp.maximum(gap, near - far[:, None])
+        gap = jnp.maximum(gap, jnp.where(length > _SAME, near - far[:, None], -jnp.inf))
         is_pair = self.has_part[first][:, None] & self.has_part[second]
         return self._least(jnp.maximum(first, second), jnp.where(is_pair, gap, jnp.inf))
 
@@ -145,7 +149,8 @@ def _from_box(point: jax.Array, half: jax.Array, is_round: jax.Array) -> jax.Arr
     radius = jnp.sqrt(point[0] ** 2 + point[1] ** 2)
     size = jnp.where(is_round & (jnp.arange(3) < 2), radius, jnp.abs(point))
     beyond = point * jnp.maximum(1.0 - half / jnp.maximum(size, 1e-9), 0.0)
-    return beyond / (jnp.linalg.norm(beyond) + 1e-9)
+    length = jnp.linalg.norm(beyond)
+    return jnp.where(length > _SAME, beyond / (length + 1e-9), 0.0)
 
 
 def body_polytopes(polytopes: Sequence[Polytope]) -> tuple[BodyPolytopes, list[str]]:

@@ -70,6 +70,9 @@ def test_gaps_between_bodies():
         for pair in ((0, second), (second, 0)):
             found = float(body.body_gap(*map(jnp.int32, pair), points, LINKS))
             np.testing.assert_allclose(found, gap, atol=1e-5)
+    # Where the points are one there is no way between them, which would separate anything.
+    same = jnp.zeros(3), jnp.zeros(3)
+    assert float(body.body_gap(jnp.int32(0), jnp.int32(2), same, LINKS)) < -0.05
     # Corner to corner no face separates as well as the way between two points.
     apart = cubes((0, 0, 0), (0.4, 0.4, 0.4))
     corners = jnp.full(3, 0.1), jnp.full(3, 0.3)
