@@ -18,7 +18,7 @@ from vrrt_jax.joint import plan_each_to_configuration
 from vrrt_jax.outcome import Progress
 from vrrt_jax.planner import Image, counted, drawn, policy_of, problem_of
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.world import World
+from vrrt_jax.scene.world import World, rooms
 from vrrt_jax.splat.model import SelfModel
 from vrrt_jax.splat.types import Camera
 from vrrt_jax.visual.goal import ImageGoal
@@ -132,7 +132,8 @@ def plan_batch(
         )
     if any(own is not worlds[0] for own in worlds):
         raise ValueError("goals known by their loss are searched for in one world; got several")
+    room = rooms(worlds[0], np.stack(starts), margin=0.0)[0]  # as in ``plan``
     results = plan_batch_by_loss(
-        robot, worlds[0], checked, policy, starts, keys, config, devices, on_progress
+        robot, room, checked, policy, starts, keys, config, devices, on_progress
     )
     return [drawn(result, goal, robot) for result, goal in zip(results, goals, strict=True)]

@@ -63,7 +63,7 @@ def test_the_margin_that_is_kept_is_the_widest_that_ends_allow(wall_world):
     wider = with_margin(wall_world, 2 * half.margin)
     assert all(vrrt_jax.is_free(half, q) for q in ends)
     assert not all(vrrt_jax.is_free(wider, q) for q in ends)
-    assert keeping_clearance(wall_world, ends, 0.0) is wall_world
+    assert keeping_clearance(wall_world.by_spheres_alone(), ends, 0.0).spheres.narrow_phase is None
     blocked = (START + GOAL)[None] / 2
     assert keeping_clearance(wall_world, blocked, 0.01) is wall_world
 
@@ -78,7 +78,8 @@ def test_another_attempt_begins_from_another_key(panda, wall_world, monkeypatch)
     real = vrrt_jax.joint.search
     monkeypatch.setattr(vrrt_jax.joint, "search", search)
     few = {"budget.max_iterations": 1, "path.margin": 0.0}
-    result = plan(panda, wall_world, **few, **{"budget.attempts": 3})
+    alone = wall_world.by_spheres_alone()  # or each attempt searches twice
+    result = plan(panda, alone, **few, **{"budget.attempts": 3})
     assert result.status is Status.MAX_ITERATIONS
     assert len({str(key) for key in keys}) == len(keys) == 3
     assert result.expansions == 3 * 32
@@ -168,4 +169,5 @@ def test_without_a_path_that_keeps_the_margin_one_without_is_searched_for(
     goal = ConfigurationGoal(q=GOAL)
     result = vrrt_jax.plan(panda, wall_world, goal, START, key=KEY, planner=planner, config=config)
     assert not result.ok
-    np.testing.assert_allclose(searched, [0.01, 0.0], atol=1e-6)
+    # At last it is searched for with polytopes where spheres touch.
+    np.testing.assert_allclose(searched, [0.01, 0.0, 0.0], atol=1e-6)

@@ -126,6 +126,8 @@ def _look(
         return state.is_apart & ((state.apart.least <= 0) | (state.gaps.least < 0))
 
     def look(state: "_State") -> "_State":
+        if not spheres.contact_distance.size:  # no two bodies are checked
+            return at_obstacle(state)
         return jax.lax.cond(state.apart.least <= 0, at_obstacle, at_bodies, state)
 
     # The deepest pair first, until one cannot be told apart.
