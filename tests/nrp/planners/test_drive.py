@@ -95,6 +95,7 @@ def test_the_snake_slides_folded_and_its_ends_are_joined():
     # Short searches do, the sampler is not asked, and the same key gives the same path.
     (found, path), (_, again) = (search(world, start, goal, folded, 1000) for _ in range(2))
     assert int(found.tree.iteration) <= 2 * MOST
+    assert path is not None
     np.testing.assert_array_equal(path[[0, -1]], [start, goal])
     np.testing.assert_array_equal(path, again)
 
