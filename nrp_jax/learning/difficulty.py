@@ -141,11 +141,10 @@ def floor_graph(index: np.ndarray, resolution: float) -> sparse.csr_matrix:
         a, b = (a[:, : a.shape[1] - j], b[:, j:]) if j >= 0 else (a[:, 1:], b[:, :-1])
         both = (a >= 0) & (b >= 0)
         length = np.full(both.sum(), resolution * np.hypot(i, j))
-        edges.append((a[both], b[both], length))
+        edges += [(a[both], b[both], length), (b[both], a[both], length)]
     a, b, length = (np.concatenate(part) for part in zip(*edges, strict=True))
     n = index.max() + 1
-    half = sparse.coo_matrix((length, (a, b)), (n, n))
-    return (half + half.T).tocsr()
+    return sparse.csr_matrix((length, (a, b)), (n, n))
 
 
 @jax.jit

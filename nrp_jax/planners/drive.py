@@ -1,6 +1,6 @@
 """By drive: the arm is folded, the base drives along the floor, the arm unfolds at the goal.
 
-With its arm inside of its base's outline a robot is a disc, and the shortest way of a disc is found
+With its arm folded a robot is little more than a disc, and the shortest way of a disc is found
 at once. So what is left of a query are two short searches: from the start to that drive, and from
 the goal to it. Letters: ``A`` joints of the arm, ``K`` configurations of a drive, ``n`` postures.
 """
@@ -12,7 +12,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import sparse
 from scipy.sparse import csgraph
 
 from nrp_jax.homes.grid import RESOLUTION, Grid
@@ -22,7 +21,7 @@ from nrp_jax.scene.robots import load_robot
 from nrp_jax.scene.world import GridWorld, build_world, corner_of
 from vrrt_jax.core.compiling import compile_together, host_jit
 from vrrt_jax.core.edge_checks import is_edge_free
-from vrrt_jax.core.edges import short_way
+from vrrt_jax.core.edges import steps_between
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import link_poses, place
@@ -32,6 +31,7 @@ DRAWN = 1 << 16  # random postures, of which the folded ones are kept
 FOLDED = 0.05  # how much farther than the most compact ones they may reach [m]
 NARROW = 20.0  # how many times as long a way counts where the robot hardly passes
 COMFORT = 0.6  # from here on, more clearance makes no way shorter [m]
+SPARSE = 2  # the way of a base that slides leads over every second cell, along each axis
 TURN = 3  # the heading is that from so many configurations before to so many after
 
 
@@ -46,19 +46,14 @@ class Folded:
 
 @single_precision
 @functools.cache
-def folded_postures(name: str) -> Folded | None:
-    """Postures that a robot with a round base may drive in; drawn once, always the same.
+def folded_postures(name: str) -> Folded:
+    """Postures that a robot may drive in; drawn once, always the same.
 
     Args:
         name: of :func:`nrp_jax.scene.robots.load_robot`.
-
-    Returns:
-        The postures; None for a robot without a round base.
     """
     robot = load_robot(name)
-    if robot.footprint is None:
-        return None
-    cells = np.zeros((30, 30, 20), bool)
+    cells = np.zeros((30, 30, 1 if robot.planar else 20), bool)
     empty = build_world(robot, Grid(occupied=cells, resolution=RESOLUTION, origin=(-1.5, -1.5, 0)))
     q = jax.random.uniform(
         jax.random.key(0), (DRAWN, robot.num_joints), minval=empty.lower, maxval=empty.upper
@@ -100,8 +95,8 @@ def find_drive(
         (K, D) configurations, some of them twice where the stretch is short. The edges from each to
         the next are free. None where the floor does not join the ends, or nothing is free.
     """
-    first, turns = world.first_arm, world.is_continuous[world.first_arm :]
-    steps = short_way(folded.arm[:, None] - np.stack([q_start, q_goal])[:, first:], turns)
+    first, postures = world.first_arm, np.pad(folded.arm, [(0, 0), (world.first_arm, 0)])
+    steps = steps_between(world, np.stack([q_start, q_goal]), postures[:, None])[..., first:]
     nearest = np.argsort(np.linalg.norm(steps, axis=-1).sum(axis=1))
     chosen = nearest[min(rank, len(nearest) - 1)]
     base = _base_drive(world, q_start, q_goal, folded.reach[chosen], folded.top[chosen])
@@ -143,13 +138,18 @@ def _checked(world: GridWorld, q: jax.Array) -> tuple[jax.Array, jax.Array]:
 def _base_drive(
     world: GridWorld, q_start: np.ndarray, q_goal: np.ndarray, reach: float, top: float
 ) -> np.ndarray | None:
-    """Places and headings (K, 3) of the base; None where the floor does not join the ends."""
+    """Places (K, 2) of the base, with the headings (K, 3) of one that drives.
+
+    None where the floor does not join the ends.
+    """
     # The clearance of the cells' centers, from all that is as low as the robot is high.
-    cell, corner = float(world.field.resolution), corner_of(world)
-    layers = int(np.ceil(top / float(world.field.step))) + 1
-    centers = slice(FINE + FINE // 2, -FINE, FINE)
+    step, corner = float(world.field.step), corner_of(world)
+    layers = int(np.ceil(top / step)) + 1
+    every = FINE if world.first_arm > 2 else FINE * SPARSE
+    cell, first = every * step, corner + FINE * step / 2  # apart; the first of them
+    centers = slice(FINE + FINE // 2, -FINE, every)
     clearance = np.asarray(world.field.values)[centers, centers, :layers].min(axis=2)
-    ends = np.floor((np.stack([q_start, q_goal])[:, :2] - corner) / cell).astype(int)
+    ends = np.round((np.stack([q_start, q_goal])[:, :2] - first) / cell).astype(int)
     a, b = map(tuple, np.clip(ends, 0, np.array(clearance.shape) - 1))
     passable = clearance > 0
     passable[a] = passable[b] = True
@@ -158,21 +158,22 @@ def _base_drive(
     index[passable] = np.arange(passable.sum())
     tight = 1 + np.maximum(COMFORT - clearance, 0)
     weight = np.where(clearance < reach, NARROW, tight)[passable]
-    graph = floor_graph(index, cell).tocoo()
-    length = graph.data * (weight[graph.row] + weight[graph.col]) / 2
-    graph = sparse.csr_matrix((length, (graph.row, graph.col)), graph.shape)
+    graph = floor_graph(index, cell)
+    graph.data *= (np.repeat(weight, np.diff(graph.indptr)) + weight[graph.indices]) / 2
     _, before = csgraph.dijkstra(graph, indices=index[a], return_predecessors=True)
     way = [int(index[b])]
     while way[-1] != index[a]:
         if before[way[-1]] < 0:
             return None
         way.append(int(before[way[-1]]))
-    places = (np.argwhere(passable)[way[::-1]] + 0.5) * cell + corner
+    places = np.argwhere(passable)[way[::-1]] * cell + first
     places = np.concatenate([[q_start[:2]], places[1:-1], [q_goal[:2]]])
-    # Evenly spaced, heading where the base goes; at the ends as they are.
+    # Evenly spaced; a base that drives heads where it goes, and at the ends as they are.
     gone = np.append(0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
     at = np.linspace(0, gone[-1], LENGTH)
     places = np.stack([np.interp(at, gone, column) for column in places.T], axis=1)
+    if world.first_arm == 2:
+        return places
     k = np.arange(LENGTH)
     ahead = places[np.minimum(k + TURN, LENGTH - 1)] - places[np.maximum(k - TURN, 0)]
     heading = np.arctan2(ahead[:, 1], ahead[:, 0])

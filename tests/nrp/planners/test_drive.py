@@ -1,5 +1,7 @@
 """Drives along the floor with a folded arm, and searches from both ends to them."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,21 +51,23 @@ def folded():
 
 @pytest.fixture(scope="module")
 def solve(world, folded):
-    def run(iterations):
-        goal = nrp_jax.ConfigurationGoal(q=jnp.asarray(GOAL))
-        policy = NRPConnect(sampler=Unasked(), straight_iterations=1000)
-        return search_by_drive(
-            world,
-            goal,
-            policy,
-            policy.init(world, goal, START[None], 4096),
-            folded=folded,
-            key=jax.random.key(0),
-            termination=make_termination(policy.goal_score(goal), max_iterations=iterations),
-            time_limit_s=60.0,
-        )
+    return functools.partial(search, world, START, GOAL, folded)
 
-    return run
+
+def search(world, start, goal, folded, iterations):
+    """A search by drive, which never asks its sampler."""
+    goal = nrp_jax.ConfigurationGoal(q=jnp.asarray(goal))
+    policy = NRPConnect(sampler=Unasked(), straight_iterations=1000)
+    return search_by_drive(
+        world,
+        goal,
+        policy,
+        policy.init(world, goal, start[None], 4096),
+        folded=folded,
+        key=jax.random.key(0),
+        termination=make_termination(policy.goal_score(goal), max_iterations=iterations),
+        time_limit_s=60.0,
+    )
 
 
 def test_folded_postures_keep_close_and_touch_nothing_of_the_robot(folded):
@@ -75,8 +79,25 @@ def test_folded_postures_keep_close_and_touch_nothing_of_the_robot(folded):
         assert not scene.touching(np.concatenate([[2.0, 2.0, 0.0], arm]))
 
 
-def test_a_robot_without_a_round_base_does_not_drive():
-    assert folded_postures("snake") is None
+def test_the_snake_slides_folded_and_its_ends_are_joined():
+    robot, grid, folded = nrp_jax.load_robot("snake"), rooms().flatten(), folded_postures("snake")
+    world = nrp_jax.build_world(robot, grid)
+    # Half of the base's diagonal; the arm alone is 0.72 m long.
+    assert len(folded.arm) > 20 and 0.106 < folded.reach.min() <= folded.reach.max() < 0.2
+    start, goal = (
+        np.concatenate([q[:2], turns]).astype(np.float32)
+        for q, turns in ((START, [0.5, 0, 0, 0.4, 0, 0]), (GOAL, [-2, 0, 1, 0, 0, 0]))
+    )
+    drive = find_drive(world, folded, start, goal)
+    assert drive is not None and drive.shape == (LENGTH, 8)
+    np.testing.assert_allclose(drive[[0, -1], :2], [start[:2], goal[:2]], atol=1e-6)
+    assert 2.5 < drive[np.abs(drive[:, 0] - 2.6).argmin(), 1] < 3.5
+    # Short searches do, the sampler is not asked, and the same key gives the same path.
+    (found, path), (_, again) = (search(world, start, goal, folded, 1000) for _ in range(2))
+    assert int(found.tree.iteration) <= 2 * MOST
+    assert path is not None
+    np.testing.assert_array_equal(path[[0, -1]], [start, goal])
+    np.testing.assert_array_equal(path, again)
 
 
 @pytest.mark.parametrize("rank", [0, 1000])
