@@ -81,7 +81,8 @@ def measure_spheres(
         q = rng.uniform(robot.lower, robot.upper, (len(part), robot.num_joints))
         true_pairs = [_by_kind(truth, row) for row in q]
         refused = [~free for free in _free(robot, obstacles, q, polytopes)]
-        rows.append(np.column_stack([[[bool(p) for p in pairs] for pairs in true_pairs], *refused]))
+        touches = np.array([[bool(p) for p in pairs] for pairs in true_pairs], bool)
+        rows.append(np.column_stack([touches.reshape(-1, 2), *refused]))
         for pairs, is_refused in zip(true_pairs, refused[1], strict=True):
             for first, second in pairs[1] if not is_refused else ():
                 names = truth.model.body(first).name, truth.model.body(second).name

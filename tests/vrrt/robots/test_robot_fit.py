@@ -144,6 +144,8 @@ def test_meshes_are_needed_to_fit_and_to_measure(panda, monkeypatch):
 
 
 def test_report_counts(arm):
+    few = measure_spheres(arm, num=10, seed=2)  # fewer than there are scenes
+    assert few.obstacles.colliding + few.obstacles.free == 10
     report = measure_spheres(arm, num=200, seed=2)
     assert report.num == 200 and report.seed == 2
     for counts in (report.obstacles, report.self_collision):
