@@ -26,23 +26,31 @@ def collision_pieces(model: mujoco.MjModel) -> dict[int, list[Piece]]:
     for geom in range(model.ngeom):
         if not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
             continue
-        rotation = np.zeros(9)
-        mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
         points, excess = _geom_points(model, geom)
-        points = points @ rotation.reshape(3, 3).T + model.geom_pos[geom]
-        piece = piece_of(points, excess)
+        piece = piece_of(in_body(model, geom, points), excess)
         pieces.setdefault(int(model.geom_bodyid[geom]), []).append(piece)
     return pieces
+
+
+def in_body(model: mujoco.MjModel, geom: int, points: np.ndarray) -> np.ndarray:
+    """Points (n, 3) in the frame of a geom as they are in the frame of its body."""
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+    return points @ rotation.reshape(3, 3).T + model.geom_pos[geom]
+
+
+def mesh_points(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """The vertices (n, 3) of a mesh geom, in its frame [m]."""
+    mesh = model.geom_dataid[geom]
+    start = model.mesh_vertadr[mesh]
+    return np.asarray(model.mesh_vert[start : start + model.mesh_vertnum[mesh]], np.float64)
 
 
 def _geom_points(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
     """Points (n, 3) in the geom's frame whose hull contains it, and the hull's excess [m]."""
     kind = mujoco.mjtGeom(model.geom_type[geom])
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        mesh = model.geom_dataid[geom]
-        start = model.mesh_vertadr[mesh]
-        points = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
-        return solid(np.asarray(points, np.float64)), 0.0
+        return solid(mesh_points(model, geom)), 0.0
     found = primitive_points(kind, model.geom_size[geom])
     if found is None:
         name = model.body(model.geom_bodyid[geom]).name

@@ -1,6 +1,7 @@
 """Polytopes of few planes that contain the bodies of a robot: tighter than spheres."""
 
 import dataclasses
+import functools
 import itertools
 
 import mujoco
@@ -9,7 +10,7 @@ from scipy.optimize import nnls
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from vrrt_jax.robots import mjcf_writer
-from vrrt_jax.robots.geom_pieces import collision_pieces
+from vrrt_jax.robots.geom_pieces import collision_pieces, in_body, mesh_points
 
 _MAX_PLANES = 48
 _TOLERANCE = 2e-3  # [m] that a polytope may stick out, if it takes no more planes
@@ -26,6 +27,11 @@ class Polytope:
     body: str
     link: int
     vertices: np.ndarray  # (V, 3) in the link's frame [m]
+
+    @functools.cached_property
+    def faces(self) -> tuple[np.ndarray, np.ndarray]:
+        """See :func:`faces`; every world of the robot needs them."""
+        return faces(self.vertices)
 
 
 def outer_polytopes(model: mujoco.MjModel) -> dict[int, list[np.ndarray]]:
@@ -127,11 +133,7 @@ def read_polytopes(model: mujoco.MjModel) -> dict[int, list[np.ndarray]]:
     """
     found: dict[int, list[np.ndarray]] = {}
     for geom in np.flatnonzero(mjcf_writer.is_polytope(model)):
-        mesh = model.geom_dataid[geom]
-        first, rotation = model.mesh_vertadr[mesh], np.zeros(9)
-        mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-        vertices = np.float64(model.mesh_vert[first : first + model.mesh_vertnum[mesh]])
-        vertices = vertices @ rotation.reshape(3, 3).T + model.geom_pos[geom]
+        vertices = in_body(model, int(geom), mesh_points(model, int(geom)))
         found.setdefault(int(model.geom_bodyid[geom]), []).append(np.round(vertices, 5))
     return found
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from vrrt_jax.core.types import pytree
 from vrrt_jax.robots.kinematics import Spheres
-from vrrt_jax.robots.polytopes import Polytope, faces
+from vrrt_jax.robots.polytopes import Polytope
 from vrrt_jax.scene.obstacles import Obstacles
 
 _SAME = 1e-5  # [m] two points that are nearer to each other have no way between them
@@ -157,9 +157,8 @@ def body_polytopes(polytopes: Sequence[Polytope]) -> tuple[BodyPolytopes, list[s
     """Polytopes as arrays, and the names (P,) of their bodies."""
     names = list(dict.fromkeys(polytope.body for polytope in polytopes))
     of_body = [[part for part in polytopes if part.body == name] for name in names]
-    planes = {id(part): faces(part.vertices) for part in polytopes}
     most = max(len(parts) for parts in of_body)
-    num_faces = max(len(offsets) for _, offsets in planes.values())
+    num_faces = max(len(part.faces[1]) for part in polytopes)
     num_vertices = max(len(part.vertices) for part in polytopes)
     shape = len(names), most
     has_part = np.zeros(shape, bool)
@@ -170,8 +169,8 @@ def body_polytopes(polytopes: Sequence[Polytope]) -> tuple[BodyPolytopes, list[s
         for m, part in enumerate(parts):
             has_part[p, m] = True
             for array, rows in (
-                (normals, planes[id(part)][0]),
-                (offsets, planes[id(part)][1]),
+                (normals, part.faces[0]),
+                (offsets, part.faces[1]),
                 (vertices, part.vertices),
             ):
                 array[p, m] = rows[0]
@@ -199,7 +198,7 @@ def bulges(polytopes: Sequence[Polytope], bodies: Sequence[str], spheres: Sphere
     """
     planes: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for polytope in polytopes:
-        planes.setdefault(polytope.body, []).append(faces(polytope.vertices))
+        planes.setdefault(polytope.body, []).append(polytope.faces)
     inside = [
         max((np.min(far - normals @ center) for normals, far in planes.get(body, ())), default=0.0)
         for body, center in zip(bodies, np.asarray(spheres.center, float), strict=True)
