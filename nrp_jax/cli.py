@@ -20,7 +20,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     from nrp_jax import online
-    from nrp_jax.bench import checks, curves, execution, planning, report, score
+    from nrp_jax.bench import checks, curves, execution, growth, planning, report, score
     from nrp_jax.homes import figure
     from nrp_jax.learning import data, train
 
@@ -37,7 +37,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_port(view)
     bench = commands.add_parser("bench", help="measure speed and success")
     benches = bench.add_subparsers(dest="what", required=True)
-    for module in (checks, planning, curves, execution):
+    for module in (checks, planning, growth, curves, execution):
         module.add_arguments(benches)
     return parser
 

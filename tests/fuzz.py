@@ -57,7 +57,7 @@ STOPS = {
         *("nrp_jax.planner._searched", "nrp_jax.bench.curves.in_workers"),
         *("nrp_jax.bench.score.score_homes", "nrp_jax.learning.train.run_epochs"),
         *("nrp_jax.online.train_online", "nrp_jax.learning.shards.in_workers"),
-        *("nrp_jax.bench.checks.run", "nrp_jax.bench.planning.run"),
+        *("nrp_jax.bench.checks.run", "nrp_jax.bench.planning.run", "nrp_jax.bench.growth.run"),
         "nrp_jax.homes.figure.generate_house",
     ),
 }

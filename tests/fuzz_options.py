@@ -35,6 +35,7 @@ BARE = {
         ["data", "--task", "fetch", "--out", "OUT/data"],
         ["bench", "checks"],
         ["bench", "plan", "--task", "snake", "--methods", "rrt"],
+        ["bench", "growth", "--methods", "rrt"],
         ["bench", "curves", "--planners", "rrt", "--nodes", "0"],
         ["plan", "--problem", "home_1", "--out", "OUT"],
     ),

@@ -177,5 +177,16 @@ def roadmap_costs(
 @functools.lru_cache(maxsize=2)
 def _built(task: str, home: QueryHome) -> tuple[MobileRobot, ExactScene, GridWorld]:
     """Robot, exact scene and world of a home; a process keeps those that it used last."""
+    _drop_programs_of_other_maps(home.grid.occupied.shape)
     robot = load_robot(task)
     return robot, ExactScene(robot, home.grid), build_world(robot, home.grid)
+
+
+@functools.lru_cache(maxsize=1)
+def _drop_programs_of_other_maps(shape: tuple[int, ...]) -> None:
+    """Free what is compiled for maps of other sizes, once for a size.
+
+    A size takes hundreds of megabytes, and homes come one after the other. What is needed again is
+    in the cache on disk.
+    """
+    jax.clear_caches()

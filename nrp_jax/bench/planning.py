@@ -2,8 +2,9 @@
 
 import argparse
 import dataclasses
+import itertools
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from vrrt_jax.core import command
 from vrrt_jax.core.files import write_text
 from vrrt_jax.core.interrupt import uninterrupted
 from vrrt_jax.core.timing import machine
+
+WITH_WAYPOINTS = ("nrp-d", "nrp-g", "nrp-star-d", "nrp-star-g")  # beside straight expansions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +69,7 @@ def run(
     max_expansions: int,
     lanes: int,
     goal_bias: float,
+    straight_rate: float,
     on_result: Callable[[PlanResult], Any] = lambda result: None,
 ) -> dict[str, Any]:
     """Solve all queries by one method; each path is checked with C MuJoCo.
@@ -78,6 +82,7 @@ def run(
         max_expansions: of a plan.
         lanes: expansions at a time.
         goal_bias: share of expansions that aim at the goal.
+        straight_rate: share of expansions that go straight, of the planners with waypoints.
         on_result: called with each plan.
 
     Returns:
@@ -103,6 +108,7 @@ def run(
                     world=home.world,
                     scene=home.scene,
                     goal_bias=goal_bias,
+                    straight_rate=straight_rate,
                     max_expansions=max_expansions,
                     lanes=lanes,
                 )
@@ -135,8 +141,12 @@ def add_arguments(subparsers: Any) -> None:
     parser.add_argument(
         "--lanes", type=command.whole(1, 4096), default=10, help="expansions at a time"
     )
+    share = {"type": command.real(0.0, 1.0), "nargs": "+"}
     parser.add_argument(
-        "--goal-bias", type=command.real(0.0, 1.0), default=0.1, help="share that aims there"
+        "--goal-bias", **share, default=[0.1], help="share that aims there; several to compare"
+    )
+    parser.add_argument(
+        "--straight-rate", **share, default=[0.2], help="share without waypoints; several too"
     )
     parser.add_argument("--discriminator", help="what nrp train wrote; packaged by default")
     parser.add_argument("--cvae", help="what nrp train wrote; packaged by default")
@@ -170,28 +180,45 @@ def _run_command(arguments: argparse.Namespace) -> int:
         if method in KINDS
     }
     homes = unseen_homes(robot, arguments.homes, arguments.queries, arguments.seed)
-    budget = {name: getattr(arguments, name) for name in ("max_expansions", "lanes", "goal_bias")}
+    budget = {name: getattr(arguments, name) for name in ("max_expansions", "lanes")}
+    shares = {name: getattr(arguments, name) for name in ("goal_bias", "straight_rate")}
     figures = {}
     for method in methods:
-        with tqdm(total=len(homes) * arguments.queries, desc=method, unit="plan") as bar:
-            figures[method] = run(
-                robot,
-                homes,
-                method,
-                samplers.get(method),
-                **budget,
-                on_result=lambda _, bar=bar: bar.update(),
-            )
-        print(f"{method}: {json.dumps(figures[method])}", flush=True)
+        rows = _settings(method, shares)
+        for row in rows:
+            several = [name for name in row if len({own[name] for own in rows}) > 1]
+            named = "".join(f" {name}={row[name]:g}" for name in several)
+            with tqdm(total=len(homes) * arguments.queries, desc=method, unit="plan") as bar:
+                figures[method + named] = run(
+                    robot,
+                    homes,
+                    method,
+                    samplers.get(method),
+                    **budget,
+                    **row,
+                    on_result=lambda _, bar=bar: bar.update(),
+                )
+            print(f"{method}{named}: {json.dumps(figures[method + named])}", flush=True)
     report = {
         "task": robot.name,
         "seed": arguments.seed,
         "homes": [home.seed for home in homes],
         "min_geodesic_m": MIN_GEODESIC,
         **budget,
+        **{name: values if len(values) > 1 else values[0] for name, values in shares.items()},
         "methods": figures,
         "machine": machine(),
     }
     if arguments.json:
         write_text(Path(arguments.json), json.dumps(report, indent=1) + "\n")
     return 0
+
+
+def _settings(method: str, shares: Mapping[str, list[float]]) -> list[dict[str, float]]:
+    """All combinations of the shares that matter to a method, the first of those that do not."""
+    matters = {
+        "goal_bias": method not in ("rrt-connect", "bit-star", *CONNECT),
+        "straight_rate": method in WITH_WAYPOINTS,
+    }
+    lists = [values if matters[name] else values[:1] for name, values in shares.items()]
+    return [dict(zip(shares, row, strict=True)) for row in itertools.product(*lists)]

@@ -140,7 +140,13 @@ def add_arguments(subparsers: Any) -> None:
     parser = subparsers.add_parser("score", help="measure how good proposed waypoints are")
     parser.set_defaults(run=_run_command)
     parser.add_argument("--task", required=True, choices=TASKS, help="whose samplers")
-    parser.add_argument("--data", required=True, help="folder that nrp data wrote: its test homes")
+    parser.add_argument("--data", required=True, help="folder that nrp data wrote")
+    parser.add_argument(
+        "--split", default="test", choices=("test", "train"), help="which of its homes"
+    )
+    parser.add_argument(
+        "--num-homes", type=command.whole(1, 100_000), help="the first ones; all if not given"
+    )
     parser.add_argument("--maps", help="folder of maps from elsewhere")
     parser.add_argument("--discriminator", help="what nrp train wrote; packaged weights by default")
     parser.add_argument("--cvae", help="what nrp train wrote; packaged weights by default")
@@ -166,7 +172,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
         kind: samplers.load_sampler(task, kind, getattr(arguments, kind), **checked)
         for kind in WAYPOINT_KINDS
     }
-    dataset = load_dataset(arguments.data, "test")
+    dataset = load_dataset(arguments.data, arguments.split)
     if dataset.settings.task != task:
         raise ValueError(
             f"the data set is of task '{dataset.settings.task}'; expected '{task}': give another "
@@ -179,7 +185,8 @@ def _run_command(arguments: argparse.Namespace) -> int:
         "cache": Path(arguments.data) / "roadmaps",
         "progress": lambda line: print(line, file=sys.stderr),
     }
-    seeds = [home_seed(dataset.settings, "test", k) for k in range(len(dataset.grids))]
+    grids = dataset.grids[: arguments.num_homes]
+    seeds = [home_seed(dataset.settings, arguments.split, k) for k in range(len(grids))]
     figures = {
         "task": task,
         "weights": {kind: getattr(arguments, kind) or "packaged" for kind in WAYPOINT_KINDS},
@@ -190,7 +197,8 @@ def _run_command(arguments: argparse.Namespace) -> int:
     }
     own = [path for kind in WAYPOINT_KINDS if (path := getattr(arguments, kind))]
     with samplers.weights_of(*own):
-        figures["unseen_homes"] = score_homes(robot, dataset.grids, tested, seeds=seeds, **settings)
+        homes = "unseen_homes" if arguments.split == "test" else "training_homes"
+        figures[homes] = score_homes(robot, grids, tested, seeds=seeds, **settings)
         if maps:
             found = score_homes(robot, [*maps.values()], tested, seeds=range(len(maps)), **settings)
             figures["maps"] = {**found, "names": [*maps]}

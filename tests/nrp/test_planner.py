@@ -329,7 +329,7 @@ def test_an_interrupted_bench_ends(snake, home, scene, monkeypatch):
         return types.SimpleNamespace(status=Status.SOLVED)
 
     monkeypatch.setattr(planning, "plan", interrupted)
-    budget = {"max_expansions": 10, "lanes": 10, "goal_bias": 0.1}
+    budget = {"max_expansions": 10, "lanes": 10, "goal_bias": 0.1, "straight_rate": 0.2}
     with pytest.raises(KeyboardInterrupt):
         planning.run(snake, [asked], "rrt", None, **budget, on_result=pytest.fail)
 
@@ -349,6 +349,14 @@ def test_bench_counts_verified_plans(snake, home, scene, tmp_path, monkeypatch, 
     assert 0 < found["median_expansions"] <= 4000 and found["mean_cost_m"] > 3.0
     assert main([*command, "--methods", "rrt-connect", "--max-expansions", "10"]) == 0
     assert json.loads(out.read_text())["methods"]["rrt-connect"]["success"] == 0.0
+    few = ["--methods", "rrt-connect,rrt,nrp-g", "--max-expansions", "10"]
+    assert main([*command, *few, "--goal-bias", "0.1", "1", "--straight-rate", "0", "0.5"]) == 0
+    assert [*json.loads(out.read_text())["methods"]] == [
+        "rrt-connect",
+        *("rrt goal_bias=0.1", "rrt goal_bias=1"),
+        *("nrp-g goal_bias=0.1 straight_rate=0", "nrp-g goal_bias=0.1 straight_rate=0.5"),
+        *("nrp-g goal_bias=1 straight_rate=0", "nrp-g goal_bias=1 straight_rate=0.5"),
+    ]
     assert main([*command, "--methods", "prm"]) == 2
     assert "unknown planner 'prm'; have: rrt, rrt-is" in capsys.readouterr().err
 

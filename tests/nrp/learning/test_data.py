@@ -85,6 +85,10 @@ def test_scores_are_written(folder, tmp_path, capsys):
     assert main([*unmapped, "--task", "snake", "--unchecked"]) == 0
     rough = json.loads(out.read_text())["unseen_homes"]["cvae"]["optimality_score"]
     assert rough < found["unseen_homes"]["cvae"]["optimality_score"]
+    trained = ["--split", "train", "--num-homes", "1"]
+    assert main([*unmapped, "--task", "snake", *trained]) == 0
+    found = json.loads(out.read_text())
+    assert "unseen_homes" not in found and len(found["training_homes"]["cvae"]["by_home"]) == 1
     assert main([*command, "--task", "fetch"]) == 2
     assert "is of task 'snake'; expected 'fetch'" in capsys.readouterr().err
 

@@ -119,6 +119,21 @@ def test_rrt_connect_samples_around_its_roots_at_all_scales(wall_world, connecte
     assert apart.min() < 0.6 and apart.max() > 2.0
 
 
+def test_rrt_connect_of_two_lanes_draws_samples_of_all_kinds_for_both_trees(wall_world, connected):
+    goal, policy = ConfigurationGoal(q=jnp.asarray(GOAL)), RRTConnect(lanes=2)
+    draw = jax.jit(policy.propose)
+    sides, samples = set(), []
+    for key in jax.random.split(jax.random.key(0), 200):
+        proposals = draw(wall_world, goal, connected.tree, key)
+        sides.add(int(proposals.aux.side[0]))
+        samples.append(np.asarray(proposals.target[0]))
+    apart = np.min(np.linalg.norm(np.array(samples)[:, None] - [START, GOAL], axis=2), axis=1)
+    assert sides == {0, 1} and apart.min() < 0.5
+    lower, upper = np.minimum(START, GOAL) - 1, np.maximum(START, GOAL) + 1
+    outside = np.any((samples < lower - 0.01) | (samples > upper + 0.01), axis=1)
+    assert 40 < outside.sum() < 160  # a quarter is anywhere, another around nodes
+
+
 def test_rrt_connect_of_an_arm_keeps_nothing_of_blocked_edges_to_the_other_tree(
     wall_world, connected
 ):

@@ -16,6 +16,7 @@ from vrrt_jax.core.types import Expansion, Proposals, Tree, pytree, static
 
 RECENT = 4  # iterations whose nodes may still be fresh
 SAME = 1e-4  # [rad] configurations nearer than this are one
+_TURNS = 16  # two trees, times four kinds of samples, times two centers of those around nodes
 
 
 @pytree
@@ -128,8 +129,7 @@ class RRTConnect:
         self, world: Space, goal: ConfigurationGoal, tree: Tree[ConnectNode], key: jax.Array
     ) -> Proposals:
         """Connect the newest fresh nodes; extend with all other lanes."""
-        lane = jnp.arange(self.lanes)
-        node = tree.payload
+        lane, node = self._numbers(key), tree.payload
 
         # The second half of the lanes connects: one fresh node each, the newest first. Among the
         # latest nodes there are enough of them: an iteration adds more than can be connected.
@@ -162,6 +162,16 @@ class RRTConnect:
             ),
         )
 
+    def _numbers(self, key: jax.Array) -> jax.Array:
+        """Numbers (B,) of the lanes, by which trees and kinds of samples take turns.
+
+        They begin anywhere where there are fewer lanes that extend than turns, so that all come.
+        """
+        lane = jnp.arange(self.lanes)
+        if self.lanes - self.lanes // 2 >= _TURNS:
+            return lane
+        return lane + jax.random.randint(jax.random.fold_in(key, _TURNS), (), 0, _TURNS)
+
     def _samples(self, world: Space, tree: Tree[ConnectNode], key: jax.Array) -> jax.Array:
         """Configurations (B, D) to extend to, of three kinds.
 
@@ -169,7 +179,7 @@ class RRTConnect:
         serve. A quarter is around nodes, half of those around either root, at distances of all
         scales: these lead out of narrow places. The others are anywhere.
         """
-        lane, num_joints = jnp.arange(self.lanes), world.lower.shape[0]
+        lane, num_joints = self._numbers(key), world.lower.shape[0]
         near, far, node, way, apart = jax.random.split(key, 5)
         q_start, q_goal = world.normalize(tree.q[:2])
         ends = jnp.stack([q_start, world.end(q_start, world.edge(q_start, q_goal))])
