@@ -2,12 +2,13 @@
 
 As Table I of Lu et al. 2024: what a unit of *visibility* and of *distance to the goal* take of
 expansions and of time. Visibility is the number of configurations, out of a dense set, to which a
-straight free edge leads from the tree. Distance is that of the shortest path that the dense roadmap
-has from the tree to the goal. Letters: ``N`` nodes of the roadmap, ``M`` nodes of a tree, ``D``
-joints.
+straight free edge leads from near nodes of the tree. Distance is that of the shortest path that the
+dense roadmap has from the tree to the goal. Letters: ``N`` nodes of the roadmap, ``M`` nodes of a
+tree, ``D`` joints.
 """
 
 import argparse
+import functools
 import json
 import sys
 from collections.abc import Mapping, Sequence
@@ -15,13 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import csgraph
 
 from nrp_jax.bench import paper
 from nrp_jax.homes.houses import CELLS, generate_house
 from nrp_jax.learning.difficulty import EXPANSIONS, GOAL_BIAS, MIN_GEODESIC
-from nrp_jax.learning.edge_check import check_edges
+from nrp_jax.learning.edge_check import check_edges, pad_rows
 from nrp_jax.learning.roadmap import Roadmap, build_roadmap
 from nrp_jax.learning.shards import DatasetSettings, home_seed
 from nrp_jax.planner import plan
@@ -40,7 +42,8 @@ from vrrt_jax.core.timing import machine
 ONE_TREE = ("rrt", "rrt-is", "cvae-rrt", "fire", "nrp-d", "nrp-g")
 SUMS = ("plans", "solved", "expansions", "search_s", "visibility", "approach_m")
 RATES = ("ms_per_visibility", "ms_per_m", "expansions_per_visibility", "expansions_per_m")
-_PAIRS = 1 << 20  # edges tried at a time
+_NEAREST = 32  # nodes of a tree that a configuration is tried from
+_BLOCK = 64  # configurations whose distances are computed at a time
 
 
 def reach(
@@ -55,17 +58,34 @@ def reach(
         q_tree: (M, D) nodes of the tree.
 
     Returns:
-        How many nodes of the roadmap a straight free edge leads to from the tree, and the length of
-        the shortest way to the goal that begins with such an edge, inf if there is none.
+        How many nodes of the roadmap a straight free edge leads to, from one of the nodes of the
+        tree that are nearest to them, and the length of the shortest way to the goal that begins
+        with such an edge, inf if there is none.
     """
-    num, shortest = len(roadmap.q), np.full(len(roadmap.q), np.inf)
+    num = len(roadmap.q)
     q = np.concatenate([roadmap.q, q_tree]).astype(np.float32)
-    tree = num + np.arange(len(q_tree))
-    for nodes in np.array_split(np.arange(num), -(-num * len(tree) // _PAIRS)):
-        pairs = np.stack(np.meshgrid(nodes, tree, indexing="ij"), axis=-1).reshape(-1, 2)
-        length, free = check_edges(world, q, pairs.astype(np.int32))
-        np.minimum.at(shortest, pairs[free, 0], length[free])
+    near = np.asarray(_nearest(world, q[num:], q[:num]))
+    pairs = np.stack([np.repeat(np.arange(num), near.shape[1]), num + near.ravel()], axis=1)
+    length, free = check_edges(world, q, pairs.astype(np.int32))
+    shortest = np.where(free, length, np.inf).reshape(near.shape).min(axis=1)
     return int(np.isfinite(shortest).sum()), float(np.min(shortest + to_goal))
+
+
+def _nearest(world: GridWorld, nodes: np.ndarray, q: np.ndarray) -> jax.Array:
+    """The nodes (n, K) of a tree (M, D) that are nearest to configurations (n, D)."""
+    room = jnp.asarray(pad_rows(nodes, 1 << (len(nodes) - 1).bit_length()))  # few shapes to compile
+    return _nearest_in(world, room, q, len(nodes), min(_NEAREST, len(nodes)))
+
+
+@functools.partial(jax.jit, static_argnums=4)
+def _nearest_in(world: GridWorld, nodes: jax.Array, q: jax.Array, size: int, num: int) -> jax.Array:
+    among = jnp.arange(len(nodes)) < size
+
+    def of_block(block: jax.Array) -> jax.Array:
+        return jax.lax.top_k(-world.distances(nodes, block, among), num)[1]
+
+    blocks = jnp.resize(q, (-(-len(q) // _BLOCK), _BLOCK, q.shape[1]))
+    return jax.lax.map(of_block, blocks).reshape(-1, num)[: len(q)]
 
 
 def queries_of(
