@@ -213,7 +213,7 @@ def add_arguments(subparsers: Any) -> None:
         "--max-expansions", type=command.whole(1, 1_000_000), default=EXPANSIONS, help="of a plan"
     )
     parser.add_argument(
-        "--lanes", type=command.whole(1, 4096), default=10, help="expansions at a time"
+        "--lanes", type=command.whole(1, 4096), default=1, help="expansions at a time"
     )
     parser.add_argument(
         "--goal-bias", type=command.real(0.0, 1.0), default=GOAL_BIAS, help="share that aims there"
