@@ -58,6 +58,11 @@ BESIDE = (
 NUM_BESIDE = 512  # configurations that are looked at there
 TURNS = 12  # in which the last joint goes all the way round
 TURNED = 3  # times as many ends of these turns as are kept
+HAND_ROUNDS = 8  # of looking for what looks like the best on the close-up, at most
+HANDS, OUTER = 256, 4  # samples of a round, of which some of the last joints are drawn anew
+HAND_SPREAD = 0.01  # [rad] of their other joints
+HANDS_KEPT = 3  # of these settle
+HAND_FITS, HAND_FAR = 1.4, 6.0  # thresholds; ends that cost less or more are left as they are
 LEAST_COVERED = 0.01  # share of a close-up; a hand that is hidden tells nothing
 
 
@@ -104,7 +109,8 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
         seed: of the samples.
     """
     config, coarse, fine = polishing.config, polishing.coarse, polishing.fine
-    ends = _search_around(world, polishing, q, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    ends = _search_around(world, polishing, q, rng)
 
     # From every minimum over a whole turn of the last joint, to the fine image.
     turned = _turns_of_last_hinge(world, coarse, ends.q, TURNED * config.kept)
@@ -120,7 +126,7 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
     if polishing.close_up is None:
         ends = _distinct_ends(world, _settled(world, fine, ends.q), config.kept)
     else:
-        ends = _settled_with_hand(world, polishing, polishing.close_up, ends)
+        ends = _settled_with_hand(world, polishing, polishing.close_up, ends, rng)
     ends = _freed(world, fine, ends, seed)
     ends = ends.take(np.lexsort([ends.cost, ~ends.free]))
     judge = getattr(fine.goal, "judge", None)
@@ -219,20 +225,39 @@ def _joined(ends: Ends, others: Ends) -> Ends:
     return Ends(*(np.concatenate(columns) for columns in zip(ends, others, strict=True)))
 
 
-def _settled_with_hand(world: World, polishing: Polishing, close_up: CloseUp, ends: Ends) -> Ends:
-    """Settle on fine image and close-up of the hand; so do half turns and twins of the best."""
-    fine, num = polishing.fine, polishing.config.kept
+def _settled_with_hand(
+    world: World,
+    polishing: Polishing,
+    close_up: CloseUp,
+    ends: Ends,
+    rng: np.random.Generator,
+) -> Ends:
+    """Settle on fine image and close-up of the hand; so does what looks like the best.
+
+    That is: its half turn and twins, and where it fits, but not well, the best of those whose outer
+    joints are drawn anew. If one of these costs less, what looks like that one is looked at next.
+    """
+    fine, kept = polishing.fine, polishing.config.kept
     goal, threshold = _hand_goal(world, fine, close_up, ends.q[0])
     weight = polishing.threshold / threshold
-    ends = _distinct_ends(world, _settled_together(world, fine, goal, weight, ends), num)
-    best = ends.q[:TWINNED]
-    others = np.concatenate([half_turned(world, best), twins(world, best)])
-    others = nearer_turns(world, others, np.asarray(fine.prior.q))
-    others = others[[np.min(distances_to(world, ends.q, q)) > SAME_END for q in others]]
-    if not len(others):
-        return ends
-    others = _settled_together(world, fine, goal, weight, derivatives(world, fine, others))
-    return _distinct_ends(world, _joined(ends, others), num)
+    ends = _distinct_ends(world, _settled_together(world, fine, goal, weight, ends), kept)
+    for _ in range(HAND_ROUNDS):
+        best = ends.q[:TWINNED]
+        others = [half_turned(world, best), twins(world, best)]
+        if HAND_FITS < ends.cost[0] / polishing.threshold < HAND_FAR:
+            drawn = redraw_outer(world, best[:1], HANDS, rng, joints=OUTER, spread=HAND_SPREAD)
+            cost = evaluate_each(world, polishing.coarse, drawn)[1]
+            cost += weight * evaluate_each(world, goal, drawn)[0]
+            order = np.argsort(cost, kind="stable")
+            others.append(drawn[distinct(world, drawn, order, HANDS_KEPT)])
+        others = nearer_turns(world, np.concatenate(others), np.asarray(fine.prior.q))
+        others = others[[np.min(distances_to(world, ends.q, q)) > SAME_END for q in others]]
+        if len(others):
+            others = _settled_together(world, fine, goal, weight, derivatives(world, fine, others))
+            ends = _distinct_ends(world, _joined(ends, others), kept)
+        if np.array_equal(ends.q[0], best[0]):
+            break
+    return ends
 
 
 def _settled_together(

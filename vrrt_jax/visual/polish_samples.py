@@ -42,14 +42,30 @@ def sample_around(
     return np.concatenate([q, half_turned(world, q), around.reshape(-1, q.shape[1])])[:num]
 
 
-def redraw_outer(world: World, q: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:
+def redraw_outer(
+    world: World,
+    q: np.ndarray,
+    num: int,
+    rng: np.random.Generator,
+    joints: int | None = None,
+    spread: float = INNER_SPREAD,
+) -> np.ndarray:
     """Samples (num, D): configurations (H, D), of which all joints from one on are drawn anew.
 
     The outer joints show least, so they are wrong most often. Where the inner ones are right, they
     are few numbers, which random changes of any joints seldom hit.
+
+    Args:
+        world: robot and obstacles.
+        q: (H, D) configurations.
+        num: of samples.
+        rng: of the draws.
+        joints: at most so many of the last ones are drawn anew; all but the first if None.
+        spread: of the others [rad].
     """
-    joints = q.shape[1]
-    anew = rng.uniform(np.asarray(world.lower), np.asarray(world.upper), (num, joints))
-    is_redrawn = np.arange(joints) >= rng.integers(1, joints, (num, 1))
-    kept = np.resize(q, (num, joints))
-    return np.where(is_redrawn, anew, kept + INNER_SPREAD * rng.normal(size=kept.shape))
+    size = q.shape[1]
+    anew = rng.uniform(np.asarray(world.lower), np.asarray(world.upper), (num, size))
+    first = 1 if joints is None else max(size - joints, 0)
+    is_redrawn = np.arange(size) >= rng.integers(first, size, (num, 1))
+    kept = np.resize(q, (num, size))
+    return np.where(is_redrawn, anew, kept + spread * rng.normal(size=kept.shape))

@@ -9,6 +9,7 @@ import pytest
 from pictures import HALF_TURNED, Q_GOAL, Q_START, picture
 
 import vrrt_jax
+import vrrt_jax.visual.polish as polish_module
 from vrrt_jax import ImageGoal, PlannerConfig, PolishConfig
 from vrrt_jax.visual.least_squares import (
     LINEARIZE_BATCH,
@@ -18,7 +19,13 @@ from vrrt_jax.visual.least_squares import (
     linearize,
     settle_each,
 )
-from vrrt_jax.visual.polish import _freed, _hand_goal, joint_uncertainty, polish
+from vrrt_jax.visual.polish import (
+    _freed,
+    _hand_goal,
+    _settled_with_hand,
+    joint_uncertainty,
+    polish,
+)
 from vrrt_jax.visual.polish_samples import nearer_turns, redraw_outer
 from vrrt_jax.visual.problem import make_problem
 
@@ -101,6 +108,24 @@ def test_a_close_up_tells_half_a_turn(panda, self_model, camera, open_world):
     assert close > fine > 1 and losses[1][0] < threshold
 
 
+def test_a_wrong_hand_is_drawn_anew_on_the_close_up(
+    panda, self_model, camera, open_world, monkeypatch
+):
+    image = picture(panda, self_model, camera, Q_GOAL, level=3)
+    polishing = polishing_of(panda, self_model, camera, image, PlannerConfig())
+    wrong = Q_GOAL + np.array([0, 0, 0, 0, 0.8, -0.5, 1.3], np.float32)
+    ends = derivatives(open_world, polishing.fine, wrong[None])
+
+    def found() -> float:
+        rng = np.random.default_rng(0)
+        ends_found = _settled_with_hand(open_world, polishing, polishing.close_up, ends, rng)
+        return float(np.abs(ends_found.q[0] - Q_GOAL).max())
+
+    assert found() < 0.02
+    monkeypatch.setattr(polish_module, "HAND_FITS", np.inf)
+    assert found() > 0.5  # its half turn and its twins alone
+
+
 def _hand_position(panda, q):
     return np.asarray(vrrt_jax.link_poses(panda.chain, jnp.asarray(q)))[-1, :3, 3].tolist()
 
@@ -122,6 +147,8 @@ def test_outer_joints_are_drawn_anew(panda, open_world, rng):
     # The first joint always stays, the last never, the others the more rarely the farther out.
     share = near.mean(axis=0)
     assert share[0] == 1.0 and np.all(np.diff(share) < 0.05) and share[-1] < 0.3
+    few = redraw_outer(open_world, q, 400, rng, joints=2, spread=0.0) == np.resize(q, (400, 7))
+    assert few[:, :5].all() and 0.3 < few[:, 5].mean() < 0.7 and not few[:, 6].any()
 
 
 def test_of_whole_turns_the_next_to_the_start_is_taken():
