@@ -180,7 +180,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
         if method in KINDS
     }
     homes = unseen_homes(robot, arguments.homes, arguments.queries, arguments.seed)
-    budget = {name: getattr(arguments, name) for name in ("max_expansions", "lanes")}
+    budget: dict[str, Any] = {n: getattr(arguments, n) for n in ("max_expansions", "lanes")}
     shares = {name: getattr(arguments, name) for name in ("goal_bias", "straight_rate")}
     figures = {}
     for method in methods:
@@ -214,7 +214,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _settings(method: str, shares: Mapping[str, list[float]]) -> list[dict[str, float]]:
+def _settings(method: str, shares: Mapping[str, list[float]]) -> list[dict[str, Any]]:
     """All combinations of the shares that matter to a method, the first of those that do not."""
     matters = {
         "goal_bias": method not in ("rrt-connect", "bit-star", *CONNECT),
