@@ -35,6 +35,13 @@ from vrrt_jax.core.edges import enforce_bounds
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.types import pytree, static
 
+# Settings of a robot where they are not those of the samplers' classes. The Fetch stands where few
+# waypoints can be reached, so that the edges to more of them are checked.
+SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
+    ("fetch", "discriminator"): {"num_edge_checked": 48},
+    ("fetch", "cvae"): {"num_edge_checked": 24},
+}
+
 
 class Sampler(Protocol):
     """Proposes where a planner should go next."""
@@ -136,9 +143,11 @@ def make_sampler(model: Model, **settings: Any) -> Any:
 
     Args:
         model: from :func:`nrp_jax.learning.checkpoint.load_model` or a training.
-        settings: fields of the sampler's class.
+        settings: fields of the sampler's class; those in :data:`SETTINGS`, or the class's, by
+            default.
     """
     robot, config = load_robot(model.config.task), model.config
+    settings = {**SETTINGS.get((config.task, config.kind), {}), **settings}
     shared = {"robot": robot, "variables": model.variables, "config": config, **settings}
     if config.kind == "discriminator":
         return DiscriminatorSampler(**shared)

@@ -82,6 +82,13 @@ def test_checking_finds_waypoints_that_can_be_reached(models, world, ends):
     assert reached(24) > reached(1) + 0.2
 
 
+@pytest.mark.parametrize("kind", ["discriminator", "cvae"])
+def test_the_fetch_looks_at_more_waypoints_unless_it_is_told_otherwise(kind):
+    fetch, snake = (samplers.load_sampler(task, kind) for task in ("fetch", "snake"))
+    assert fetch.num_edge_checked == 3 * snake.num_edge_checked
+    assert samplers.load_sampler("fetch", kind, num_edge_checked=1).num_edge_checked == 1
+
+
 def test_nrp_g_takes_the_farthest_waypoint_that_can_be_reached(world, ends):
     """The farthest of all, where none can."""
     sampler = samplers.load_sampler("snake", "cvae")
