@@ -62,7 +62,7 @@ HAND_ROUNDS = 8  # of looking for what looks like the best on the close-up, at m
 HANDS, OUTER = 256, 4  # samples of a round, of which some of the last joints are drawn anew
 HAND_SPREAD = 0.01  # [rad] of their other joints
 HANDS_KEPT = 3  # of these settle
-HAND_FITS, HAND_FAR = 1.4, 6.0  # thresholds; ends that cost less or more are left as they are
+HAND_FITS, HAND_FAR = 2.0, 6.0  # thresholds; ends that cost less or more are left as they are
 LEAST_COVERED = 0.01  # share of a close-up; a hand that is hidden tells nothing
 
 
@@ -241,10 +241,11 @@ def _settled_with_hand(
     goal, threshold = _hand_goal(world, fine, close_up, ends.q[0])
     weight = polishing.threshold / threshold
     ends = _distinct_ends(world, _settled_together(world, fine, goal, weight, ends), kept)
+    fits_badly = HAND_FITS < ends.cost[0] / polishing.threshold < HAND_FAR
     for _ in range(HAND_ROUNDS):
         best = ends.q[:TWINNED]
         others = [half_turned(world, best), twins(world, best)]
-        if HAND_FITS < ends.cost[0] / polishing.threshold < HAND_FAR:
+        if fits_badly:
             drawn = redraw_outer(world, best[:1], HANDS, rng, joints=OUTER, spread=HAND_SPREAD)
             cost = evaluate_each(world, polishing.coarse, drawn)[1]
             cost += weight * evaluate_each(world, goal, drawn)[0]
