@@ -41,7 +41,12 @@ from vrrt_jax.core.timing import machine
 # Planners whose tree begins at the start, and which end with their first path.
 ONE_TREE = ("rrt", "rrt-is", "cvae-rrt", "fire", "nrp-d", "nrp-g")
 SUMS = ("plans", "solved", "expansions", "search_s", "visibility", "approach_m")
-RATES = ("ms_per_visibility", "ms_per_m", "expansions_per_visibility", "expansions_per_m")
+RATES: tuple[str, ...] = (
+    "ms_per_visibility",
+    "ms_per_m",
+    "expansions_per_visibility",
+    "expansions_per_m",
+)
 _NEAREST = 32  # nodes of a tree that a configuration is tried from
 _BLOCK = 64  # configurations whose distances are computed at a time
 
