@@ -98,7 +98,7 @@ def queries_of(
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Starts (D,), goals (D,) and the lengths (N,) from all nodes of a roadmap to each goal.
 
-    Both are nodes of the roadmap, and the path between them has 5 m at least.
+    Both are nodes of the roadmap. The path between them has 5 m at least, or as much as there is.
     """
     rng, found = np.random.default_rng(seed), []
     for goal in rng.integers(0, len(roadmap.q), num):
