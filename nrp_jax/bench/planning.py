@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from nrp_jax.config import PlannerConfig
 from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning.difficulty import EXPANSIONS, MIN_GEODESIC, fair_house, long_queries
 from nrp_jax.learning.shards import DatasetSettings, home_seed
@@ -69,7 +70,7 @@ def run(
     max_expansions: int,
     lanes: int,
     goal_bias: float,
-    straight_rate: float,
+    straight_rate: float = PlannerConfig.straight_rate,
     on_result: Callable[[PlanResult], Any] = lambda result: None,
 ) -> dict[str, Any]:
     """Solve all queries by one method; each path is checked with C MuJoCo.
@@ -146,7 +147,10 @@ def add_arguments(subparsers: Any) -> None:
         "--goal-bias", **share, default=[0.1], help="share that aims there; several to compare"
     )
     parser.add_argument(
-        "--straight-rate", **share, default=[0.2], help="share without waypoints; several too"
+        "--straight-rate",
+        **share,
+        default=[PlannerConfig.straight_rate],
+        help="share without waypoints; several too",
     )
     parser.add_argument("--discriminator", help="what nrp train wrote; packaged by default")
     parser.add_argument("--cvae", help="what nrp train wrote; packaged by default")
