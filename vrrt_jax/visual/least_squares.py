@@ -4,7 +4,7 @@ Far from a minimum every step asks for derivatives anew. Near one they hardly ch
 costs one render, and not one more for each joint.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +18,6 @@ from vrrt_jax.core.types import pytree
 from vrrt_jax.scene.world import World
 from vrrt_jax.splat.lanes import map_lanes
 
-LINEARIZE_BATCH = 4  # configurations in one call: with their differences, a batch of renders
 EVALUATE_BATCH = 8  # configurations whose cost alone is asked for, in one call
 FD_STEP = 2e-4  # [rad] step of the finite differences; longer ones lose the weak directions
 RIDGE = 1e-7  # keeps joints that no pixel sees where they are
@@ -101,29 +100,28 @@ def descend(world: World, objective: Objective, q: np.ndarray, steps: int) -> En
 
 def derivatives(world: World, objective: Objective, q: np.ndarray) -> Ends:
     """Configurations (n, D) as they are, inside the limits."""
-    return Ends(*in_batches(linearize, world, objective, q, LINEARIZE_BATCH))
+    return _each(lambda q: linearize(world, objective, q), np.asarray(q, np.float32))
 
 
 def settle_each(world: World, objectives: list[Objective], q: np.ndarray, steps: int) -> Ends:
     """Each of configurations (n, D) near its minimum, see :func:`settle`."""
-    items = [(objective, a, jnp.int32(steps)) for objective, a in zip(objectives, q, strict=True)]
-    found = map_on_threads(lambda item: settle(world, *item), items)
+    items = list(zip(objectives, q, strict=True))
+    return _each(lambda item: settle(world, *item, jnp.int32(steps)), items)
+
+
+def _each(program: Callable, items: Sequence[Any]) -> Ends:
+    """Ends of a program that makes one of each item."""
+    found = map_on_threads(program, items)
     return Ends(*(np.stack(column) for column in zip(*found, strict=True)))
 
 
 def evaluate_each(world: World, objective: Objective, q: np.ndarray) -> list[np.ndarray]:
     """Loss (n,) of the goal and cost (n,) at configurations (n, D)."""
-    return in_batches(evaluate, world, objective, q, EVALUATE_BATCH)
-
-
-def in_batches(
-    function: Callable, world: World, objective: Objective, q: np.ndarray, size: int
-) -> list[np.ndarray]:
-    """Arrays (n, ...) about configurations (n, D), a few at a time: one program serves any n."""
-    batches = -(-len(q) // size)
-    padded = np.resize(q, (batches * size, q.shape[1])).astype(np.float32)
+    # A few at a time: one program serves any number.
+    batches = -(-len(q) // EVALUATE_BATCH)
+    padded = np.resize(q, (batches * EVALUATE_BATCH, q.shape[1])).astype(np.float32)
     found = map_on_threads(
-        lambda batch: function(world, objective, batch), np.split(padded, batches)
+        lambda batch: evaluate(world, objective, batch), np.split(padded, batches)
     )
     return [np.concatenate(column)[: len(q)] for column in zip(*found, strict=True)]
 
@@ -139,20 +137,23 @@ def evaluate(world: World, objective: Objective, q: jax.Array) -> tuple[jax.Arra
 
 @host_jit
 def linearize(world: World, objective: Objective, q: jax.Array) -> tuple[jax.Array, ...]:
-    """Columns of :class:`Ends` at configurations (n, D); derivatives are finite differences."""
+    """A row of :class:`Ends` at a configuration (D,); derivatives are finite differences.
+
+    One at a time: the images of several and of their differences are more than the caches hold.
+    """
     q = enforce_bounds(world, q)
-    seen, jacobian = _predictions(world, objective, q)
+    seen, jacobian = _prediction(world, objective, q)
     weight = objective.weight
     residual = seen - objective.goal.target()
-    loss = jnp.sum(residual**2, axis=1)
-    prior, slope = jax.vmap(lambda q: objective.prior.at(world, q))(q)
+    loss = jnp.sum(residual**2)
+    prior, slope = objective.prior.at(world, q)
     return (
         q,
         loss,
         weight * loss + prior,
-        weight * jnp.einsum("nip,np->ni", jacobian, residual) + slope,
-        weight * jnp.einsum("nip,njp->nij", jacobian, jacobian) + objective.prior.matrix,
-        jax.vmap(world.is_free)(q),
+        weight * jacobian @ residual + slope,
+        weight * jacobian @ jacobian.T + objective.prior.matrix,
+        world.is_free(q),
     )
 
 
@@ -172,7 +173,7 @@ def settle(
         A row of :class:`Ends`; its slope is that of the first derivatives.
     """
     q = enforce_bounds(world, q)
-    seen, jacobian = (column[0] for column in _predictions(world, objective, q[None]))
+    seen, jacobian = _prediction(world, objective, q)
     target, weight = objective.goal.target(), objective.weight
     matrix = weight * jacobian @ jacobian.T + objective.prior.matrix
     diagonal = jnp.diag(matrix)
@@ -203,10 +204,9 @@ def settle(
     return q, loss, cost, slope, matrix, world.is_free(q)
 
 
-def _predictions(world: World, objective: Objective, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Predictions (n, M) of configurations (n, D), and their derivatives (n, D, M)."""
-    joints = q.shape[1]
-    places = q[:, None] + FD_STEP * jnp.eye(joints + 1, joints, -1)
-    seen = map_lanes(lambda q: objective.goal.prediction(world, q), places.reshape(-1, joints))
-    seen = seen.reshape(len(q), joints + 1, -1)
-    return seen[:, 0], (seen[:, 1:] - seen[:, :1]) / FD_STEP
+def _prediction(world: World, objective: Objective, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The prediction (M,) of a configuration (D,), and its derivatives (D, M)."""
+    joints = len(q)
+    places = q + FD_STEP * jnp.eye(joints + 1, joints, -1)
+    seen = map_lanes(lambda q: objective.goal.prediction(world, q), places)
+    return seen[0], (seen[1:] - seen[0]) / FD_STEP

@@ -49,6 +49,9 @@ LEAST_TOLD = 1e-3  # of a threshold per rad^2; joints that raise the loss by les
 SETTLE_STEPS = 8  # at most, on the large images
 PROMISING = 6.0  # times the least cost; ends that cost more, and do not match, are left
 RIVALS = 2.0  # times the least cost; ends that cost more on the fine image are left
+# Passes on fine image and close-up, after which an end that goes on to save as much of its cost in
+# each as in the one before should cost no more than so many times the least.
+FORESEEN, ALIKE = 16, 1.1
 TWINNED = 2  # best ends whose kinematic twins, and half turns of the hand, are looked at
 SAME_END = 0.1  # [rad] half turns of a hand, and twins, this near to an end are that end
 BESIDE = (
@@ -153,7 +156,9 @@ def compile_polishing(world: World, polishing: Polishing) -> None:
     for goal in (coarse, fine):
         settle_each(world, [goal], q, 0)
     if polishing.close_up is not None:
+        derivatives(world, fine, q)
         near = _hand_goal(world, fine, polishing.close_up, q[0])[0]
+        evaluate_each(world, near, q)
         settle_each(world, [near], q, 0)
 
 
@@ -242,6 +247,7 @@ def _settled_with_hand(
     weight = polishing.threshold / threshold
     ends = _distinct_ends(world, _settled_together(world, fine, goal, weight, ends), kept)
     fits_badly = HAND_FITS < ends.cost[0] / polishing.threshold < HAND_FAR
+    tried = ends.q
     for _ in range(HAND_ROUNDS):
         best = ends.q[:TWINNED]
         others = [half_turned(world, best), twins(world, best)]
@@ -252,9 +258,12 @@ def _settled_with_hand(
             order = np.argsort(cost, kind="stable")
             others.append(drawn[distinct(world, drawn, order, HANDS_KEPT)])
         others = nearer_turns(world, np.concatenate(others), np.asarray(fine.prior.q))
-        others = others[[np.min(distances_to(world, ends.q, q)) > SAME_END for q in others]]
+        known = np.concatenate([tried, ends.q])
+        others = others[[np.min(distances_to(world, known, q)) > SAME_END for q in others]]
         if len(others):
-            others = _settled_together(world, fine, goal, weight, derivatives(world, fine, others))
+            tried = np.concatenate([tried, others])
+            others = derivatives(world, fine, others)
+            others = _settled_together(world, fine, goal, weight, others, ends.cost[0])
             ends = _distinct_ends(world, _joined(ends, others), kept)
         if np.array_equal(ends.q[0], best[0]):
             break
@@ -262,13 +271,26 @@ def _settled_with_hand(
 
 
 def _settled_together(
-    world: World, fine: Objective, goal: Objective, weight: float, ends: Ends
+    world: World,
+    fine: Objective,
+    goal: Objective,
+    weight: float,
+    ends: Ends,
+    least: float = np.inf,
 ) -> Ends:
     """Settle on the fine image and another one, which has a weight, together.
 
     The cost is the sum of both. In each pass the fine image's is taken for the parabola that it is
     around the ends of the one before; a hand slides farther than that holds. Ends go on while that
-    pays, and while they cost little more than the best.
+    pays, and while they cost little more than the best, or would not if they went on like this.
+
+    Args:
+        world: robot and obstacles.
+        fine: the fine image.
+        goal: the other image.
+        weight: of that one.
+        ends: where to begin, with derivatives on the fine image.
+        least: cost of the best end so far.
     """
     goal = dataclasses.replace(goal, weight=jnp.float32(weight))
     rows, done = np.arange(len(ends.q)), ends._replace(cost=np.full(len(ends.q), np.inf))
@@ -282,6 +304,9 @@ def _settled_together(
         both = ends._replace(cost=ends.cost + weight * close.loss, matrix=close.matrix)
         pays = both.cost < (1 - PAYS) * done.cost[rows]
         pays &= both.cost < RIVALS * np.min(both.cost)
+        least = min(least, np.min(both.cost))
+        foreseen = both.cost * np.minimum(both.cost / done.cost[rows], 1.0) ** FORESEEN
+        pays &= foreseen < ALIKE * least
         better = both.cost < done.cost[rows]
         for column, new in zip(done, both, strict=True):
             column[rows[better]] = new[better]
