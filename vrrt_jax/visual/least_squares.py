@@ -4,7 +4,7 @@ Far from a minimum every step asks for derivatives anew. Near one they hardly ch
 costs one render, and not one more for each joint.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -105,11 +105,11 @@ def derivatives(world: World, objective: Objective, q: np.ndarray) -> Ends:
 
 def settle_each(world: World, objectives: list[Objective], q: np.ndarray, steps: int) -> Ends:
     """Each of configurations (n, D) near its minimum, see :func:`settle`."""
-    items = list(zip(objectives, q, strict=True))
+    items = zip(objectives, q, strict=True)
     return _each(lambda item: settle(world, *item, jnp.int32(steps)), items)
 
 
-def _each(program: Callable, items: Sequence[Any]) -> Ends:
+def _each(program: Callable, items: Iterable[Any]) -> Ends:
     """Ends of a program that makes one of each item."""
     found = map_on_threads(program, items)
     return Ends(*(np.stack(column) for column in zip(*found, strict=True)))
