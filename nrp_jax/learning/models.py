@@ -56,8 +56,8 @@ class ModelConfig:
             wide["channels"] = (32, 64, 96)
         if kind == "cvae":
             wide |= {"context": 384, "width": 384}
-            # Measured for the snake's windows alone.
-            wide["blocked_weight"] = 0.5 if (task, scope) == ("snake", "window") else 0.0
+            blocked = {"snake": 0.5, "fetch": 0.3}  # measured for windows alone
+            wide["blocked_weight"] = blocked[task] if scope == "window" else 0.0
         if kind == GLOBAL_CVAE:
             wide |= {"context": 256, "width": 256}
         return cls(task=task, kind=kind, scope=scope, **wide)

@@ -83,6 +83,12 @@ def test_checking_finds_waypoints_that_can_be_reached(models, world, ends):
 
 
 @pytest.mark.parametrize("kind", ["discriminator", "cvae"])
+@pytest.mark.parametrize("task", ["snake", "fetch"])
+def test_packaged_networks_are_those_that_training_makes_by_default(task, kind):
+    assert samplers.load_sampler(task, kind).config == ModelConfig.default(task, kind)
+
+
+@pytest.mark.parametrize("kind", ["discriminator", "cvae"])
 def test_the_fetch_looks_at_more_waypoints_unless_it_is_told_otherwise(kind):
     fetch, snake = (samplers.load_sampler(task, kind) for task in ("fetch", "snake"))
     assert fetch.num_edge_checked == 3 * snake.num_edge_checked
