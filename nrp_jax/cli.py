@@ -54,8 +54,8 @@ def _add_plan(commands) -> None:
     plan.add_argument("--goal", type=command.numbers, help="as --goal=...")
     plan.add_argument(
         "--method",
-        help="nrp-connect (default), rrt, rrt-is, rrt-connect, cvae-rrt, nrp-d, nrp-g or, of the "
-        "fetch, fire; or, to shorten the path until the budget ends, bit-star, rrt-star, "
+        help="nrp-connect (default), rrt, rrt-is, rrt-connect, cvae-rrt, nrp-d, nrp-g, "
+        "nrp-d-floor, nrp-g-floor or, of the fetch, fire; or, to shorten the path until the budget ends, bit-star, rrt-star, "
         "irrt-star, cvae-irrt-star, next, nrp-star-d, nrp-star-g, nrp-star-connect or, of the "
         "fetch, fire-star, decomposed or, to take it least time, nrp-star-quick",
     )

@@ -50,6 +50,7 @@ class CVAESampler(Generator):
     # So many waypoints are made, and their edges checked; the longest that is free is taken.
     num_edge_checked: int = static(default=8)
     edge_checks: int = static(default=12)  # configurations checked along each of these edges
+    floor: Any = None  # FloorWays, by which the nearest to the goal is taken instead
 
     def propose(
         self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
@@ -63,8 +64,11 @@ class CVAESampler(Generator):
         """Waypoints as :meth:`propose` makes them, and how many configurations it checked."""
         q = self.generate(world, q_from, q_goal, self.num_edge_checked, key)
         if self.num_edge_checked > 1:
-            length = world.length(world.edge(jnp.broadcast_to(q_from[:, None], q.shape), q))
-            q = jnp.take_along_axis(q, jnp.argsort(-length, axis=1)[..., None], axis=1)
+            if self.floor is None:
+                rank = -world.length(world.edge(jnp.broadcast_to(q_from[:, None], q.shape), q))
+            else:
+                rank = self.floor.between(q, q_goal[:, None])
+            q = jnp.take_along_axis(q, jnp.argsort(rank, axis=1)[..., None], axis=1)
         return first_free(world, q_from, q, self.edge_checks)
 
 

@@ -80,6 +80,8 @@ class DiscriminatorSampler:
     # The edges to so many of the best candidates are checked; the first that is free is taken.
     num_edge_checked: int = static(default=16)
     edge_checks: int = static(default=12)  # configurations checked along each of these edges
+    # FloorWays; the odds of a candidate fall by a factor of e for each meter that is left from it.
+    floor: Any = None
 
     def propose(
         self, world: GridWorld, q_from: jax.Array, q_goal: jax.Array, key: jax.Array
@@ -100,6 +102,9 @@ class DiscriminatorSampler:
                 self.robot, inputs, q, points, possible, self.max_scored
             )
         logits = self._score(inputs, q, points)
+        if self.floor is not None:
+            there = features.to_world(q, inputs.center[:, None])
+            logits -= self.floor.between(there, q_goal[:, None])
         # The best candidates, back in the map and inside the limits.
         num = min(self.num_edge_checked, q.shape[1])
         _, best = jax.lax.top_k(jnp.where(possible, logits, -jnp.inf), num)

@@ -1,19 +1,22 @@
 """The planners of homes by name."""
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from nrp_jax.config import EDGE_STEPS, PlannerConfig
+from nrp_jax.generators import CVAESampler
 from nrp_jax.learning.models import FIRE, GLOBAL_CVAE, NEXT
 from nrp_jax.planners.cvae import CVAERRT, CVAEInformedRRTStar
+from nrp_jax.planners.floor_ways import floor_ways
 from nrp_jax.planners.next_planner import NEXTPlanner
 from nrp_jax.planners.nrp import NeuralRRT
 from nrp_jax.planners.nrp_connect import NRPConnect, packaged_sampler
 from nrp_jax.planners.nrp_star import NeuralRRTStar
 from nrp_jax.retrieval import UNIFORM_SHARE
-from nrp_jax.samplers import check_fits, load_sampler, packaged_file
+from nrp_jax.samplers import DiscriminatorSampler, check_fits, load_sampler, packaged_file
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld
 from vrrt_jax.core.planners import RRT, BITStar, InformedRRTStar, RRTConnect, RRTStar
@@ -22,9 +25,11 @@ from vrrt_jax.core.types import ExpansionPolicy
 RESTARTS, QUICK = "nrp-star-connect", "nrp-star-quick"
 CONNECT = ("nrp-connect", RESTARTS, QUICK)
 DECOMPOSED = "decomposed"
+BY_FLOOR = ("nrp-d-floor", "nrp-g-floor")  # NRP that asks the floor what is near
 # Those of the last two rows go on to improve their paths until the budget ends.
 PLANNERS = (
-    *("rrt", "rrt-is", "rrt-connect", "cvae-rrt", "fire", "nrp-d", "nrp-g", "nrp-connect"),
+    *("rrt", "rrt-is", "rrt-connect", "cvae-rrt", "fire", "nrp-d", "nrp-g", *BY_FLOOR),
+    "nrp-connect",
     *("rrt-star", "irrt-star", "bit-star", "cvae-irrt-star", "next"),
     *("nrp-star-d", "nrp-star-g", RESTARTS, QUICK, "fire-star", DECOMPOSED),
 )
@@ -38,6 +43,8 @@ KINDS = {
     "fire-star": FIRE,
     "nrp-d": "discriminator",
     "nrp-g": "cvae",
+    "nrp-d-floor": "discriminator",
+    "nrp-g-floor": "cvae",
     "nrp-star-d": "discriminator",
     "nrp-star-g": "cvae",
     **dict.fromkeys(CONNECT, "cvae"),
@@ -138,6 +145,11 @@ def policy_of(
         return NRPConnect(sampler=sampler, lanes=max(config.lanes, 2))
     rate = jnp.float32(config.straight_rate)
     learned = {"goal_bias": bias, "sampler": sampler, "straight_rate": rate, **shape}
+    if planner in BY_FLOOR:
+        floor = floor_ways(robot, world)
+        if isinstance(sampler, DiscriminatorSampler | CVAESampler):
+            learned["sampler"] = dataclasses.replace(sampler, floor=floor)
+        return NeuralRRT(**learned, floor=floor)
     if planner.startswith("nrp-star"):
         return NeuralRRTStar(**learned, **REWIRING)
     return NeuralRRT(**learned)

@@ -35,6 +35,7 @@ class NeuralRRT(RRT):
 
     sampler: Any  # a pytree with ``propose(world, q_from, q_goal, key) -> (B, D)``
     straight_rate: Any = 0.2  # () share of lanes
+    floor: Any = None  # FloorWays, over which the nearest node is looked for; a departure
 
     def propose(
         self, world: GridWorld, goal: ConfigurationGoal, tree: Tree, key: jax.Array
@@ -42,6 +43,10 @@ class NeuralRRT(RRT):
         """Go to waypoints, or straight towards the aims."""
         key_aim, key_straight, key_sampler = jax.random.split(key, 3)
         parent, aim = self.sample_aims(world, goal, tree, key_aim)
+        if self.floor is not None:
+            apart = self.floor.between(aim[:, None], tree.q[None])
+            apart = jnp.where(trees.occupied(tree), apart, jnp.inf)
+            parent = jnp.argmin(apart, axis=1).astype(parent.dtype)
         straight = jax.random.uniform(key_straight, (self.lanes,)) < self.straight_rate
         straight = straight.at[0].set(straight[0] | (tree.iteration == 0))
         waypoint, checked = proposed(self.sampler, world, tree.q[parent], aim, key_sampler)
