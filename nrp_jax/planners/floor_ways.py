@@ -18,7 +18,7 @@ from nrp_jax.homes.houses import BODY, ERODE
 from nrp_jax.learning.difficulty import floor_graph
 from nrp_jax.scene.field import FINE
 from nrp_jax.scene.robots import MobileRobot
-from nrp_jax.scene.world import GridWorld
+from nrp_jax.scene.world import GridWorld, corner_of
 from vrrt_jax.core.types import pytree
 
 SIDE = 0.25  # of a place, a square, at most: neighbors are never on two sides of a wall [m]
@@ -71,7 +71,8 @@ def floor_ways(robot: MobileRobot, world: GridWorld) -> FloorWays:
     cells = max(int(SIDE / (FINE * step) + 1e-6), 1)
     side = cells * FINE * step
     place, length = _ways(free.tobytes(), free.shape, cells, side)
-    return FloorWays(place=place, length=length, side=jnp.float32(side), corner=world.lower[:2])
+    corner = jnp.asarray(corner_of(world), jnp.float32)
+    return FloorWays(place=place, length=length, side=jnp.float32(side), corner=corner)
 
 
 @functools.lru_cache(maxsize=8)
