@@ -147,7 +147,7 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
 
 
 def compile_polishing(world: World, polishing: Polishing) -> None:
-    """Run every program of :func:`polish` once, at the start."""
+    """Run every program that :func:`polish` always needs once, at the start."""
     soft, coarse, fine = polishing.soft, polishing.coarse, polishing.fine
     q = np.asarray(fine.prior.q)[None]
     derivatives(world, soft, q)
@@ -158,7 +158,6 @@ def compile_polishing(world: World, polishing: Polishing) -> None:
     if polishing.close_up is not None:
         derivatives(world, fine, q)
         near = _hand_goal(world, fine, polishing.close_up, q[0])[0]
-        evaluate_each(world, near, q)
         settle_each(world, [near], q, 0)
 
 
