@@ -16,7 +16,7 @@ from scipy.sparse import csgraph
 
 from nrp_jax.homes.grid import RESOLUTION, Grid
 from nrp_jax.learning.difficulty import floor_graph
-from nrp_jax.scene.field import FINE
+from nrp_jax.scene.field import FINE, floor_clearance
 from nrp_jax.scene.robots import load_robot
 from nrp_jax.scene.world import GridWorld, build_world, corner_of
 from vrrt_jax.core.compiling import compile_together, host_jit
@@ -144,11 +144,9 @@ def _base_drive(
     """
     # The clearance of the cells' centers, from all that is as low as the robot is high.
     step, corner = float(world.field.step), corner_of(world)
-    layers = int(np.ceil(top / step)) + 1
-    every = FINE if world.first_arm > 2 else FINE * SPARSE
-    cell, first = every * step, corner + FINE * step / 2  # apart; the first of them
-    centers = slice(FINE + FINE // 2, -FINE, every)
-    clearance = np.asarray(world.field.values)[centers, centers, :layers].min(axis=2)
+    every = 1 if world.first_arm > 2 else SPARSE
+    cell, first = FINE * every * step, corner + FINE * step / 2  # apart; the first of them
+    clearance = floor_clearance(world.field, top, every)
     ends = np.round((np.stack([q_start, q_goal])[:, :2] - first) / cell).astype(int)
     a, b = map(tuple, np.clip(ends, 0, np.array(clearance.shape) - 1))
     passable = clearance > 0

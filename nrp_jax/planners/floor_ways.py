@@ -16,7 +16,7 @@ from scipy.sparse import csgraph
 
 from nrp_jax.homes.houses import BODY, ERODE
 from nrp_jax.learning.difficulty import floor_graph
-from nrp_jax.scene.field import FINE
+from nrp_jax.scene.field import floor_clearance
 from nrp_jax.scene.robots import MobileRobot
 from nrp_jax.scene.world import GridWorld, corner_of
 from vrrt_jax.core.types import pytree
@@ -58,18 +58,15 @@ def floor_ways(robot: MobileRobot, world: GridWorld) -> FloorWays:
     Raises:
         ValueError: the map has no such place, or too many.
     """
-    step = float(world.field.step)
-    layers = int(np.ceil(BODY[robot.name] / step)) + 1
-    centers = slice(FINE + FINE // 2, -FINE, FINE)  # of the cells; the field has a rim of one
-    clearance = np.asarray(world.field.values)[centers, centers, :layers].min(axis=2)
-    free = clearance > ERODE
+    free = floor_clearance(world.field, BODY[robot.name]) > ERODE
     if not free.any():
         raise ValueError(
             f"no place of the map has {ERODE} m of free space around it: plan with nrp-connect, "
             "which needs no floor"
         )
-    cells = max(int(SIDE / (FINE * step) + 1e-6), 1)
-    side = cells * FINE * step
+    cell = float(world.field.resolution)
+    cells = max(int(SIDE / cell + 1e-6), 1)
+    side = cells * cell
     place, length = _ways(free.tobytes(), free.shape, cells, side)
     corner = jnp.asarray(corner_of(world), jnp.float32)
     return FloorWays(place=place, length=length, side=jnp.float32(side), corner=corner)

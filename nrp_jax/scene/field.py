@@ -52,6 +52,19 @@ def make_field(grid: Grid) -> DistanceField:
     return DistanceField(values=jnp.asarray(distance, jnp.float32), step=jnp.float32(step))
 
 
+def floor_clearance(field: DistanceField, height: float, every: int = 1) -> np.ndarray:
+    """Clearances (X, Y) of the centers of cells from all that is as low as a height; on the host.
+
+    Args:
+        field: of the map.
+        height: what is higher does not count [m].
+        every: only so many cells apart, along each axis.
+    """
+    layers = int(np.ceil(height / float(field.step))) + 1
+    centers = slice(FINE + FINE // 2, -FINE, FINE * every)  # without the rim
+    return np.asarray(field.values)[centers, centers, :layers].min(axis=2)
+
+
 def _refine(solid: np.ndarray, axis: int) -> np.ndarray:
     """Turn n cells along an axis into n * FINE + 1 lattice points.
 
