@@ -18,6 +18,7 @@ from nrp_jax.planners.by_name import DECOMPOSED, PLANNERS, QUICK, RESTARTS, poli
 from nrp_jax.planners.decomposed import search_decomposed, shortcut_legs
 from nrp_jax.planners.drive import folded_postures
 from nrp_jax.planners.nrp_connect import NRPConnect, default_planner
+from nrp_jax.planners.one_tree import plan_one_tree
 from nrp_jax.planners.restarts import search_with_restarts
 from nrp_jax.planners.shorten import shorten, shorten_parts
 from nrp_jax.scene.configurations import check_configuration
@@ -31,6 +32,7 @@ from vrrt_jax.core.check_protocols import check_extracted_path, check_policy
 from vrrt_jax.core.edges import nearest_turn
 from vrrt_jax.core.goal import ConfigurationGoal, starts_at
 from vrrt_jax.core.interrupt import interruptible
+from vrrt_jax.core.planners import RRT
 from vrrt_jax.core.postprocess import CheckedPath, plan_result, postprocess, unchecked
 from vrrt_jax.core.precision import single_precision
 from vrrt_jax.core.result import STATUS_OF, PlanResult, Status
@@ -130,14 +132,40 @@ def plan(
         found = no_search(policy, goal, tree)
         at_goal = np.asarray(start)[None]
         return _moved(_finish(scene, world, places, goal, at_goal, found, key), places)
+
+    def finish(world: GridWorld, found: SearchResult, path: np.ndarray | None) -> PlanResult:
+        check_extracted_path(policy, path, np.asarray(start))
+        raw = np.asarray(start)[None] if path is None else path
+        return _finish(scene, world, places, goal, raw, found, key, shorter)
+
+    def accept(path: np.ndarray) -> bool:
+        return _is_free_part(scene, world, places, path)
+
+    most = max(config.max_expansions // policy.lanes, 1)
+    options = {"max_capacity": config.max_capacity, "on_progress": on_progress}
+    if isinstance(policy, RRT) and tree.payload is None and planner != DECOMPOSED:
+        with interruptible():
+            result = plan_one_tree(
+                world,
+                goal,
+                policy,
+                tree,
+                finish=functools.partial(finish, world),
+                accept=accept,
+                key=jax.random.fold_in(key, 0),
+                termination=make_termination(policy.goal_score(goal), max_iterations=most),
+                time_limit_s=config.time_limit_s,
+                **options,
+            )
+        return _moved(result, places)
     tried, spent, rejected = 0, Counter(), Counter()
     results: list[PlanResult] = []
     with interruptible() as interrupted:
         for attempt in range(ATTEMPTS):
             left_s = config.time_limit_s - spent["search_s"]
-            if attempt and (config.max_expansions - tried < policy.lanes or left_s <= 0):
+            left = most - tried // policy.lanes
+            if attempt and (left < 1 or left_s <= 0):
                 break
-            iterations = max((config.max_expansions - tried) // policy.lanes, 1)
             found, path = _searched(
                 planner,
                 robot,
@@ -147,15 +175,13 @@ def plan(
                 tree,
                 places,
                 scene,
+                accept=accept,
                 key=jax.random.fold_in(key, attempt),
-                termination=make_termination(policy.goal_score(goal), max_iterations=iterations),
+                termination=make_termination(policy.goal_score(goal), max_iterations=left),
                 time_limit_s=left_s,
-                max_capacity=config.max_capacity,
-                on_progress=on_progress,
+                **options,
             )
-            check_extracted_path(policy, path, np.asarray(start))
-            raw = np.asarray(start)[None] if path is None else path
-            results.append(_finish(scene, world, places, goal, raw, found, key, shorter))
+            results.append(finish(world, found, path))
             tried += results[-1].expansions
             spent.update(results[-1].timing)
             rejected.update(results[-1].rejected)
@@ -197,6 +223,8 @@ def _searched(
     tree: Any,
     places: "_Places",
     scene: ExactScene,
+    *,
+    accept: Callable[[np.ndarray], bool],
     **options: Any,
 ) -> tuple[SearchResult, np.ndarray | None]:
     """What a planner finds, and the path (P, D) if there is one."""
@@ -206,9 +234,6 @@ def _searched(
         options["folded"] = folded_postures(robot.name)
         if planner not in (RESTARTS, QUICK):
             return search_by_drive(world, goal, policy, tree, **options)
-
-        def accept(path: np.ndarray) -> bool:
-            return _is_free_part(scene, world, places, path)
 
         def seconds(path: np.ndarray) -> float:
             key, path = jax.random.key(0), places.of_path(path)

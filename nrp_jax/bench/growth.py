@@ -27,7 +27,7 @@ from nrp_jax.learning.edge_check import check_edges, pad_rows
 from nrp_jax.learning.roadmap import Roadmap, build_roadmap
 from nrp_jax.learning.shards import DatasetSettings, home_seed
 from nrp_jax.planner import plan
-from nrp_jax.planners.by_name import KINDS, check_names
+from nrp_jax.planners.by_name import BY_FLOOR, KINDS, check_names
 from nrp_jax.samplers import load_sampler
 from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.robots import MobileRobot, load_robot
@@ -39,7 +39,7 @@ from vrrt_jax.core.markdown import table
 from vrrt_jax.core.timing import machine
 
 # Planners whose tree begins at the start, and which end with their first path.
-ONE_TREE = ("rrt", "rrt-is", "cvae-rrt", "fire", "nrp-d", "nrp-g")
+ONE_TREE = ("rrt", "rrt-is", "cvae-rrt", "fire", "nrp-d", "nrp-g", *BY_FLOOR)
 SUMS = ("plans", "solved", "expansions", "search_s", "visibility", "approach_m")
 RATES: tuple[str, ...] = (
     "ms_per_visibility",

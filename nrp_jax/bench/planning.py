@@ -16,7 +16,7 @@ from nrp_jax.homes.houses import CELLS
 from nrp_jax.learning.difficulty import EXPANSIONS, MIN_GEODESIC, fair_house, long_queries
 from nrp_jax.learning.shards import DatasetSettings, home_seed
 from nrp_jax.planner import PlanResult, Status, plan
-from nrp_jax.planners.by_name import BY_FLOOR, CONNECT, KINDS, check_names
+from nrp_jax.planners.by_name import BY_FLOOR, CONNECT, KINDS, STAR_BY_FLOOR, check_names
 from nrp_jax.planners.nrp_connect import UNCHECKED
 from nrp_jax.scene.exact import ExactScene
 from nrp_jax.scene.robots import MobileRobot, load_robot
@@ -27,7 +27,7 @@ from vrrt_jax.core.interrupt import uninterrupted
 from vrrt_jax.core.timing import machine
 
 # Of these some expansions go straight.
-WITH_WAYPOINTS = ("nrp-d", "nrp-g", *BY_FLOOR, "nrp-star-d", "nrp-star-g")
+WITH_WAYPOINTS = ("nrp-d", "nrp-g", *BY_FLOOR, "nrp-star-d", "nrp-star-g", *STAR_BY_FLOOR)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,13 +25,15 @@ from vrrt_jax.core.types import ExpansionPolicy
 RESTARTS, QUICK = "nrp-star-connect", "nrp-star-quick"
 CONNECT = ("nrp-connect", RESTARTS, QUICK)
 DECOMPOSED = "decomposed"
-BY_FLOOR = ("nrp-d-floor", "nrp-g-floor")  # NRP that asks the floor what is near
+# NRP that asks the floor what is near; those of the second pair improve their paths.
+BY_FLOOR = ("nrp-d-floor", "nrp-g-floor")
+STAR_BY_FLOOR = ("nrp-star-d-floor", "nrp-star-g-floor")
 # Those of the last two rows go on to improve their paths until the budget ends.
 PLANNERS = (
     *("rrt", "rrt-is", "rrt-connect", "cvae-rrt", "fire", "nrp-d", "nrp-g", *BY_FLOOR),
     "nrp-connect",
     *("rrt-star", "irrt-star", "bit-star", "cvae-irrt-star", "next"),
-    *("nrp-star-d", "nrp-star-g", RESTARTS, QUICK, "fire-star", DECOMPOSED),
+    *("nrp-star-d", "nrp-star-g", *STAR_BY_FLOOR, RESTARTS, QUICK, "fire-star", DECOMPOSED),
 )
 FETCH_ONLY = ("fire", "fire-star", QUICK, DECOMPOSED)  # of a base that drives
 # Of the samplers that planners need.
@@ -41,12 +43,8 @@ KINDS = {
     "next": NEXT,
     "fire": FIRE,
     "fire-star": FIRE,
-    "nrp-d": "discriminator",
-    "nrp-g": "cvae",
-    "nrp-d-floor": "discriminator",
-    "nrp-g-floor": "cvae",
-    "nrp-star-d": "discriminator",
-    "nrp-star-g": "cvae",
+    **dict.fromkeys(("nrp-d", "nrp-star-d", BY_FLOOR[0], STAR_BY_FLOOR[0]), "discriminator"),
+    **dict.fromkeys(("nrp-g", "nrp-star-g", BY_FLOOR[1], STAR_BY_FLOOR[1]), "cvae"),
     **dict.fromkeys(CONNECT, "cvae"),
 }
 # How trees are rewired: by edges as long as those that they grow by.
@@ -144,12 +142,10 @@ def policy_of(
     if planner in CONNECT:
         return NRPConnect(sampler=sampler, lanes=max(config.lanes, 2))
     rate = jnp.float32(config.straight_rate)
-    learned = {"goal_bias": bias, "sampler": sampler, "straight_rate": rate, **shape}
-    if planner in BY_FLOOR:
-        floor = floor_ways(robot, world)
-        if isinstance(sampler, DiscriminatorSampler | CVAESampler):
-            learned["sampler"] = dataclasses.replace(sampler, floor=floor)
-        return NeuralRRT(**learned, floor=floor)
+    floor = floor_ways(robot, world) if planner in BY_FLOOR + STAR_BY_FLOOR else None
+    if floor is not None and isinstance(sampler, DiscriminatorSampler | CVAESampler):
+        sampler = dataclasses.replace(sampler, floor=floor)
+    learned = {"goal_bias": bias, "sampler": sampler, "straight_rate": rate, "floor": floor}
     if planner.startswith("nrp-star"):
-        return NeuralRRTStar(**learned, **REWIRING)
-    return NeuralRRT(**learned)
+        return NeuralRRTStar(**learned, **shape, **REWIRING)
+    return NeuralRRT(**learned, **shape)

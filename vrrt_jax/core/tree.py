@@ -222,6 +222,37 @@ def joined(grown: Sequence[Tree[Payload]], roots: int) -> Tree[Payload]:
     )
 
 
+def without(tree: Tree[Payload], nodes: Sequence[int]) -> Tree[Payload]:
+    """The tree without some nodes and all that hangs on them; on the host.
+
+    Payloads must tell of their own nodes alone, not of others by their numbers.
+    """
+    size, parent = int(tree.size), np.asarray(tree.parent)
+    kept = np.ones(size, bool)
+    kept[list(nodes)] = False
+    has_parent = parent[:size] >= 0
+    above = np.where(has_parent, parent[:size], 0)
+    while np.any(lost := kept & has_parent & ~kept[above]):
+        kept &= ~lost
+    rows = np.flatnonzero(kept)
+    number = np.cumsum(kept) - 1  # that a node has from now on
+
+    def compact(column: Array, fill: Any = 0) -> jax.Array:
+        column = np.asarray(column)
+        more = np.full((len(column) - len(rows), *column.shape[1:]), fill, column.dtype)
+        return jnp.asarray(np.concatenate([column[rows], more]))
+
+    return dataclasses.replace(
+        tree,
+        q=compact(tree.q),
+        parent=compact(np.where(parent >= 0, number[np.maximum(parent, 0)], -1), -1),
+        cost=compact(tree.cost),
+        score=compact(tree.score, np.inf),
+        size=jnp.int32(len(rows)),
+        payload=jax.tree.map(compact, tree.payload),
+    )
+
+
 def branch_path(tree: Tree, index: int) -> np.ndarray:
     """The path (P, D) to a node from the root that it hangs on."""
     return np.asarray(tree.q)[lineage(tree, index)]

@@ -1,0 +1,104 @@
+"""Plans with one tree: what the exact check refuses is cut off the tree, and the rest grows on."""
+
+import dataclasses
+import itertools
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from nrp_jax.scene.world import GridWorld
+from vrrt_jax.core import tree as trees
+from vrrt_jax.core.goal import REACHED, ConfigurationGoal
+from vrrt_jax.core.planners import RRT
+from vrrt_jax.core.result import PlanResult, Status
+from vrrt_jax.core.search import COST, SearchResult, Termination, search
+from vrrt_jax.core.types import Tree
+
+
+def plan_one_tree(
+    world: GridWorld,
+    goal: ConfigurationGoal,
+    policy: RRT,
+    tree: Tree[None],
+    *,
+    finish: Callable[[SearchResult, np.ndarray], PlanResult],
+    accept: Callable[[np.ndarray], bool],
+    key: jax.Array,
+    termination: Termination,
+    time_limit_s: float,
+    **options: Any,
+) -> PlanResult:
+    """Search until a path is verified; a planner that shortens its path goes on until its budget ends.
+
+    Edges are checked at sub-steps, so that a path may touch something in between. The edges of it
+    that do are cut off, with all that hangs on them, and the rest of the tree grows on. Should the
+    path at the end of the budget be refused, the first one stays.
+
+    Args:
+        world: the robot in a home.
+        goal: where to.
+        policy: a planner whose nodes have no payload.
+        tree: from ``policy.init``.
+        finish: shortens and verifies what a search found, the path (P, D) of it.
+        accept: the exact check of an edge (2, D).
+        key: random key.
+        termination: of all searches together.
+        time_limit_s: wall time [s] of searches, and of what was done about paths that were refused,
+            without compilation.
+        options: of :func:`vrrt_jax.core.search.search`.
+
+    Returns:
+        The result; its ``timing`` is that of all searches, and its history tells of no path that
+        was refused.
+    """
+    to_first = dataclasses.replace(termination, score=np.float32(goal.threshold))
+    spent, refused, rows = Counter(), 0, []
+
+    def go_on(tree: Tree[None], until: Termination) -> PlanResult:
+        """Search on from a tree, and what comes of it."""
+        nonlocal refused
+        begun_s = spent["search_s"]
+        # The key of an iteration comes of its number, so that all searches may have the same one.
+        left = {"termination": until, "time_limit_s": time_limit_s - begun_s}
+        found = search(world, goal, policy, tree, key=key, **left, **options)
+        started = time.perf_counter()
+        result = finish(found, policy.extract_path(found.tree))
+        spent.update(result.timing)
+        refused += result.refused
+        rows.append(found.history + np.array([0.0, begun_s, 0.0, 0.0, 0.0, 0.0]))
+        if result.status is Status.NOT_VERIFIED:
+            rows[-1][:, COST] = np.inf
+            spent["search_s"] += time.perf_counter() - started
+        return result
+
+    result = go_on(tree, to_first)
+    most = int(termination.max_iterations)
+    while result.status is Status.NOT_VERIFIED:
+        tree = _without_refused(result.tree, accept)
+        if spent["search_s"] >= time_limit_s or result.iterations >= most:
+            break
+        result = go_on(tree, to_first)
+    if result.ok and termination.score < to_first.score and spent["search_s"] < time_limit_s:
+        last = go_on(result.tree, termination)
+        if last.ok:
+            result = last
+        else:
+            rows[-1][:, COST] = rows[-2][-1, COST]
+            numbers = ("tree", "iterations", "expansions", "rejected")
+            result = dataclasses.replace(result, **{n: getattr(last, n) for n in numbers})
+    return dataclasses.replace(
+        result, timing=dict(spent), history=np.concatenate(rows), refused=refused
+    )
+
+
+def _without_refused(tree: Tree[None], accept: Callable[[np.ndarray], bool]) -> Tree[None]:
+    """The tree without the edges of its best path that are refused, nor what hangs on them."""
+    chain = trees.lineage(tree, int(trees.best_node(tree, REACHED)))
+    q = np.asarray(tree.q)
+    edges = itertools.pairwise(chain.tolist())
+    cut = [child for node, child in edges if not accept(q[[node, child]])]
+    return trees.without(tree, cut or chain[-1:].tolist())
