@@ -57,8 +57,8 @@ def _add_plan(commands) -> None:
         help="nrp-connect (default), rrt, rrt-is, rrt-connect, cvae-rrt, nrp-d, nrp-g, "
         "nrp-d-floor, nrp-g-floor or, of the fetch, fire; or, to shorten the path until the budget "
         "ends, bit-star, rrt-star, irrt-star, cvae-irrt-star, next, nrp-star-d, nrp-star-g, "
-        "nrp-star-connect or, of the fetch, fire-star, decomposed or, to take it least time, "
-        "nrp-star-quick",
+        "nrp-star-d-floor, nrp-star-g-floor, nrp-star-connect or, of the fetch, fire-star, "
+        "decomposed or, to take it least time, nrp-star-quick",
     )
     plan.add_argument("--model", help="what nrp train wrote; packaged weights by default")
     plan.add_argument("--crop", type=command.numbers, help="plan in x0,y0,x1,y1 of the map [m]")

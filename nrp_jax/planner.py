@@ -76,8 +76,9 @@ def plan(
     ``time_limit_s``, whichever ends first; column 4 of ``history`` is the length of the path over
     time.
 
-    Should the path that was found touch something between two of the planner's checks, it plans
-    again with checks twice as fine, up to twice, with what is left of the budgets.
+    Should the path that was found touch something between two of the planner's checks, those with
+    one tree cut the edges off that do, and go on. The others plan again with checks twice as fine,
+    up to twice. Both take what is left of the budgets.
 
     Args:
         robot: from :func:`nrp_jax.load_robot`.
@@ -121,11 +122,12 @@ def plan(
             f"capacity is {config.capacity}; expected at least {policy.lanes + 2}, two more than "
             "the lanes: raise it or lower lanes"
         )
+    tree = policy.init(world, goal, np.asarray(start)[None], config.capacity)
+    has_one_tree = isinstance(policy, RRT) and tree.payload is None and planner != DECOMPOSED
     # Shorter paths keep closer to obstacles, and a planner that goes on until its budget ends has
     # none left to plan again: its checks are twice as fine from the first.
-    if policy.goal_score(goal) == -np.inf:
+    if policy.goal_score(goal) == -np.inf and not has_one_tree:
         world = dataclasses.replace(world, resolution=world.resolution / 2)
-    tree = policy.init(world, goal, np.asarray(start)[None], config.capacity)
     shorter = shortcut_legs if planner == DECOMPOSED else shorten
     scene = scene or ExactScene(robot, grid)
     if starts_at(goal, world, start):
@@ -143,14 +145,14 @@ def plan(
 
     most = max(config.max_expansions // policy.lanes, 1)
     options = {"max_capacity": config.max_capacity, "on_progress": on_progress}
-    if isinstance(policy, RRT) and tree.payload is None and planner != DECOMPOSED:
+    if has_one_tree:
         with interruptible():
             result = plan_one_tree(
                 world,
                 goal,
                 policy,
                 tree,
-                finish=functools.partial(finish, world),
+                finish=finish,
                 accept=accept,
                 key=jax.random.fold_in(key, 0),
                 termination=make_termination(policy.goal_score(goal), max_iterations=most),

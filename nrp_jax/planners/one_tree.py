@@ -25,25 +25,26 @@ def plan_one_tree(
     policy: RRT,
     tree: Tree[None],
     *,
-    finish: Callable[[SearchResult, np.ndarray], PlanResult],
+    finish: Callable[[GridWorld, SearchResult, np.ndarray | None], PlanResult],
     accept: Callable[[np.ndarray], bool],
     key: jax.Array,
     termination: Termination,
     time_limit_s: float,
     **options: Any,
 ) -> PlanResult:
-    """Search until a path is verified; a planner that shortens its path goes on until its budget ends.
+    """Search until a path is verified; a planner that shortens paths goes on until its budget ends.
 
     Edges are checked at sub-steps, so that a path may touch something in between. The edges of it
-    that do are cut off, with all that hangs on them, and the rest of the tree grows on. Should the
-    path at the end of the budget be refused, the first one stays.
+    that do are cut off, with all that hangs on them, and the rest of the tree grows on. Shorter
+    paths keep closer to obstacles: checks are twice as fine from the first path on. Should the path
+    at the end of the budget be refused, the first one stays.
 
     Args:
         world: the robot in a home.
         goal: where to.
         policy: a planner whose nodes have no payload.
         tree: from ``policy.init``.
-        finish: shortens and verifies what a search found, the path (P, D) of it.
+        finish: shortens and verifies what a search in a world found, the path (P, D) of it.
         accept: the exact check of an edge (2, D).
         key: random key.
         termination: of all searches together.
@@ -55,10 +56,12 @@ def plan_one_tree(
         The result; its ``timing`` is that of all searches, and its history tells of no path that
         was refused.
     """
-    to_first = dataclasses.replace(termination, score=np.float32(goal.threshold))
-    spent, refused, rows = Counter(), 0, []
+    first = np.maximum(termination.score, np.float32(goal.threshold))
+    to_first = dataclasses.replace(termination, score=first)
+    spent: Counter[str] = Counter()
+    refused, rows = 0, []
 
-    def go_on(tree: Tree[None], until: Termination) -> PlanResult:
+    def go_on(world: GridWorld, tree: Tree[None], until: Termination) -> PlanResult:
         """Search on from a tree, and what comes of it."""
         nonlocal refused
         begun_s = spent["search_s"]
@@ -66,7 +69,7 @@ def plan_one_tree(
         left = {"termination": until, "time_limit_s": time_limit_s - begun_s}
         found = search(world, goal, policy, tree, key=key, **left, **options)
         started = time.perf_counter()
-        result = finish(found, policy.extract_path(found.tree))
+        result = finish(world, found, policy.extract_path(found.tree))
         spent.update(result.timing)
         refused += result.refused
         rows.append(found.history + np.array([0.0, begun_s, 0.0, 0.0, 0.0, 0.0]))
@@ -75,15 +78,16 @@ def plan_one_tree(
             spent["search_s"] += time.perf_counter() - started
         return result
 
-    result = go_on(tree, to_first)
+    result = go_on(world, tree, to_first)
     most = int(termination.max_iterations)
     while result.status is Status.NOT_VERIFIED:
         tree = _without_refused(result.tree, accept)
         if spent["search_s"] >= time_limit_s or result.iterations >= most:
             break
-        result = go_on(tree, to_first)
+        result = go_on(world, tree, to_first)
     if result.ok and termination.score < to_first.score and spent["search_s"] < time_limit_s:
-        last = go_on(result.tree, termination)
+        finer = dataclasses.replace(world, resolution=world.resolution / 2)
+        last = go_on(finer, result.tree, termination)
         if last.ok:
             result = last
         else:
