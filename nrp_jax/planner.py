@@ -123,10 +123,11 @@ def plan(
             "the lanes: raise it or lower lanes"
         )
     tree = policy.init(world, goal, np.asarray(start)[None], config.capacity)
-    has_one_tree = isinstance(policy, RRT) and tree.payload is None and planner != DECOMPOSED
+    is_plain = tree.payload is None and planner != DECOMPOSED
+    one_tree = policy if isinstance(policy, RRT) and is_plain else None
     # Shorter paths keep closer to obstacles, and a planner that goes on until its budget ends has
     # none left to plan again: its checks are twice as fine from the first.
-    if policy.goal_score(goal) == -np.inf and not has_one_tree:
+    if policy.goal_score(goal) == -np.inf and one_tree is None:
         world = dataclasses.replace(world, resolution=world.resolution / 2)
     shorter = shortcut_legs if planner == DECOMPOSED else shorten
     scene = scene or ExactScene(robot, grid)
@@ -140,17 +141,15 @@ def plan(
         raw = np.asarray(start)[None] if path is None else path
         return _finish(scene, world, places, goal, raw, found, key, shorter)
 
-    def accept(path: np.ndarray) -> bool:
-        return _is_free_part(scene, world, places, path)
-
+    accept = functools.partial(_is_free_part, scene, world, places)
     most = max(config.max_expansions // policy.lanes, 1)
     options = {"max_capacity": config.max_capacity, "on_progress": on_progress}
-    if has_one_tree:
+    if one_tree is not None:
         with interruptible():
             result = plan_one_tree(
                 world,
                 goal,
-                policy,
+                one_tree,
                 tree,
                 finish=finish,
                 accept=accept,

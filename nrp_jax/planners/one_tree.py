@@ -58,7 +58,7 @@ def plan_one_tree(
     """
     first = np.maximum(termination.score, np.float32(goal.threshold))
     to_first = dataclasses.replace(termination, score=first)
-    spent: Counter[str] = Counter()
+    spent: Any = Counter()
     refused, rows = 0, []
 
     def go_on(world: GridWorld, tree: Tree[None], until: Termination) -> PlanResult:
