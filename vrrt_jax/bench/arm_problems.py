@@ -1,6 +1,6 @@
 """Joint-goal problems of arms as files: obstacles, a start and a goal each.
 
-A file is a NumPy archive of ``N`` problems. ``docs/arms_results.md`` lists its keys.
+A file is a NumPy archive of ``N`` problems. ``docs/benchmarks.md`` lists its keys.
 """
 
 import dataclasses
