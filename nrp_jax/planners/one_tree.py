@@ -68,24 +68,28 @@ def plan_one_tree(
         # The key of an iteration comes of its number, so that all searches may have the same one.
         left = {"termination": until, "time_limit_s": time_limit_s - begun_s}
         found = search(world, goal, policy, tree, key=key, **left, **options)
-        started = time.perf_counter()
-        result = finish(world, found, policy.extract_path(found.tree))
-        spent.update(result.timing)
-        refused += result.refused
         rows.append(found.history + np.array([0.0, begun_s, 0.0, 0.0, 0.0, 0.0]))
+        result = finish(world, found, policy.extract_path(found.tree))
         if result.status is Status.NOT_VERIFIED:
             rows[-1][:, COST] = np.inf
-            spent["search_s"] += time.perf_counter() - started
+        spent.update(result.timing)
+        refused += result.refused
         return result
 
+    def is_budget_left(result: PlanResult) -> bool:
+        most = int(termination.max_iterations)
+        return spent["search_s"] < time_limit_s and result.iterations < most
+
     result = go_on(world, tree, to_first)
-    most = int(termination.max_iterations)
-    while result.status is Status.NOT_VERIFIED:
+    while result.status is Status.NOT_VERIFIED and is_budget_left(result):
+        started = time.perf_counter()
         tree = _without_refused(result.tree, accept)
-        if spent["search_s"] >= time_limit_s or result.iterations >= most:
-            break
+        spent["search_s"] += time.perf_counter() - started
+        for name in ("shortcut_s", "verify_s"):  # of a refused path: a part of the search
+            spent["search_s"] += result.timing[name]
+            spent[name] -= result.timing[name]
         result = go_on(world, tree, to_first)
-    if result.ok and termination.score < to_first.score and spent["search_s"] < time_limit_s:
+    if result.ok and termination.score < to_first.score and is_budget_left(result):
         finer = dataclasses.replace(world, resolution=world.resolution / 2)
         last = go_on(finer, result.tree, termination)
         if last.ok:
