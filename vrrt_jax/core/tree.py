@@ -235,7 +235,7 @@ def without(tree: Tree[Payload], nodes: Sequence[int]) -> Tree[Payload]:
     while np.any(lost := kept & has_parent & ~kept[above]):
         kept &= ~lost
     rows = np.flatnonzero(kept)
-    number = np.cumsum(kept) - 1  # that a node has from now on
+    number = (np.cumsum(kept) - 1).astype(parent.dtype)  # that a node has from now on
 
     def compact(column: Array, fill: Any = 0) -> jax.Array:
         column = np.asarray(column)
