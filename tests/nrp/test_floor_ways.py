@@ -73,7 +73,7 @@ def test_fine_cells_make_no_smaller_squares(snake):
     assert 4.6 < between(ways, LEFT, RIGHT) < 5.8
 
 
-@pytest.mark.parametrize("method", ["nrp-d-floor", "nrp-g-floor"])
+@pytest.mark.parametrize("method", ["nrp-d-floor", "nrp-g-floor", "nrp-star-g-floor"])
 def test_planners_go_by_the_floor(snake, method):
     """Both ends are nearer to each other than to the door: the door is found even so."""
     q = np.zeros((2, 8), np.float32)
