@@ -43,8 +43,8 @@ KINDS = {
     "next": NEXT,
     "fire": FIRE,
     "fire-star": FIRE,
-    **dict.fromkeys(("nrp-d", "nrp-star-d", BY_FLOOR[0], STAR_BY_FLOOR[0]), "discriminator"),
-    **dict.fromkeys(("nrp-g", "nrp-star-g", BY_FLOOR[1], STAR_BY_FLOOR[1]), "cvae"),
+    **dict.fromkeys(("nrp-d", "nrp-d-floor", "nrp-star-d", "nrp-star-d-floor"), "discriminator"),
+    **dict.fromkeys(("nrp-g", "nrp-g-floor", "nrp-star-g", "nrp-star-g-floor"), "cvae"),
     **dict.fromkeys(CONNECT, "cvae"),
 }
 # How trees are rewired: by edges as long as those that they grow by.

@@ -200,9 +200,7 @@ def joined(grown: Sequence[Tree[Payload]], roots: int) -> Tree[Payload]:
         rows += [
             np.asarray(column)[roots:size] for column, size in zip(columns, sizes, strict=True)
         ]
-        whole = np.concatenate(rows)
-        width = [(0, capacity - len(whole)), *[(0, 0)] * (whole.ndim - 1)]
-        return jnp.asarray(np.pad(whole, width, constant_values=fill))
+        return _padded_on_host(np.concatenate(rows), capacity, fill)
 
     parents = [
         np.where(np.asarray(tree.parent) < roots, tree.parent, tree.parent - roots + place)
@@ -238,9 +236,7 @@ def without(tree: Tree[Payload], nodes: Sequence[int]) -> Tree[Payload]:
     number = (np.cumsum(kept) - 1).astype(parent.dtype)  # that a node has from now on
 
     def compact(column: Array, fill: Any = 0) -> jax.Array:
-        column = np.asarray(column)
-        more = np.full((len(column) - len(rows), *column.shape[1:]), fill, column.dtype)
-        return jnp.asarray(np.concatenate([column[rows], more]))
+        return _padded_on_host(np.asarray(column)[rows], tree.capacity, fill)
 
     return dataclasses.replace(
         tree,
@@ -251,6 +247,12 @@ def without(tree: Tree[Payload], nodes: Sequence[int]) -> Tree[Payload]:
         size=jnp.int32(len(rows)),
         payload=jax.tree.map(compact, tree.payload),
     )
+
+
+def _padded_on_host(rows: np.ndarray, capacity: int, fill: Any) -> jax.Array:
+    """A column of so many slots; on the host, so that no number of rows compiles anything."""
+    width = [(0, capacity - len(rows)), *[(0, 0)] * (rows.ndim - 1)]
+    return jnp.asarray(np.pad(rows, width, constant_values=fill))
 
 
 def branch_path(tree: Tree, index: int) -> np.ndarray:
