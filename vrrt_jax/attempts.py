@@ -23,7 +23,7 @@ from vrrt_jax.core.timing import timed
 from vrrt_jax.core.types import ExpansionPolicy, Goal, Tree
 from vrrt_jax.outcome import Progress, time_left
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.scene.world import World
+from vrrt_jax.scene.world import World, pose_error
 from vrrt_jax.visual import lineages
 from vrrt_jax.visual import policy as published
 from vrrt_jax.visual.finish import finish_visual
@@ -37,6 +37,8 @@ MORE_EACH = 2  # attempts that do more than the one before
 CONFIRMING = 2  # more attempts where a match is in doubt, or has no path
 DOUBTFUL = 0.5  # of the threshold; a match with a larger loss is in doubt
 UNLIKELY = 0.5  # probability of a match; one below is looked for again as if it were none
+SAME_POSE = 0.05  # [rad] mean over the joints; two attempts that end as near agree
+STRANGE = 2.0  # thresholds; colors as far off are another lamp's, and not a wrong pose's
 ROOT_SAMPLES, ROOT_BATCHES = 4096, 8  # random configurations, of which some are roots
 
 
@@ -57,10 +59,14 @@ def plan_by_loss(
     """
     with interruptible():
         result = attempt(robot, world, problem, policy, roots, key, config, on_progress)
+        ends = [result.target]
         for again in range(1, config.budget.attempts):
             rest = time_left(config, result.timing["search_s"])
-            # A match in doubt is believed if a few more attempts find no better one.
+            # A match in doubt is believed if a few more attempts find no better one, or, under
+            # another lamp, where all are in doubt, if one more ends there too.
             in_doubt = _is_in_doubt(result)
+            if result.colored_loss > STRANGE * result.match_threshold:
+                in_doubt &= not _was_found_twice(world, result.target, ends)
             few_more = in_doubt or result.status in (Status.NO_PATH, Status.NOT_VERIFIED)
             goes_on = result.status is Status.NO_MATCH or (few_more and again <= CONFIRMING)
             goes_on |= in_doubt and result.match_probability < UNLIKELY
@@ -75,6 +81,7 @@ def plan_by_loss(
                 others = promising_roots(world, problem.goal, key, max(room, 0))
                 places = np.concatenate([roots, others])
             other = attempt(robot, world, problem, policy, places, key, rest, on_progress)
+            ends.append(other.target)
             if other.status in ABORTED and not other.ok:
                 # It ended before its loss could be compared with the other's.
                 best = dataclasses.replace(result, status=other.status, advice=other.advice)
@@ -88,6 +95,11 @@ def _is_in_doubt(result: PlanResult) -> bool:
     """Whether the image fits a match less well, or in stranger colors, than most true poses."""
     threshold = result.match_threshold
     return result.ok and (result.loss > DOUBTFUL * threshold or result.colored_loss > threshold)
+
+
+def _was_found_twice(world: World, target: np.ndarray, ends: Sequence[np.ndarray]) -> bool:
+    """Whether two attempts ended at a configuration (D,)."""
+    return sum(pose_error(world, end, target).mean() < SAME_POSE for end in ends) > 1
 
 
 def _is_better(other: PlanResult, result: PlanResult, ambiguity: float) -> bool:

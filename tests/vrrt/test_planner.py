@@ -178,13 +178,17 @@ def test_another_attempt_while_nothing_matches(
     result = vrrt_jax.plan(*args, key=jax.random.key(0), config=config)
     assert result.status is vrrt_jax.Status.INTERRUPTED and result.loss == results[0].loss
 
-    # A match in doubt is looked for again, and longer if it is unlikely too.
+    # A match in doubt is looked for again, and longer if it is unlikely too; under another lamp
+    # until it is found twice.
     threshold = results[0].match_threshold
-    for loss, color, probability, expected in (
-        (0.4, 0.9, 0.3, 1),
-        (0.6, 0.9, 0.8, 3),
-        (0.4, 1.1, 0.8, 3),
-        (0.6, 0.9, 0.3, 6),
+    for loss, color, probability, apart, expected in (
+        (0.4, 0.9, 0.3, 0.0, 1),
+        (0.6, 0.9, 0.8, 0.0, 3),
+        (0.4, 1.1, 0.8, 0.0, 3),
+        (0.6, 0.9, 0.3, 0.0, 6),
+        (0.6, 2.1, 0.3, 0.0, 2),
+        (0.6, 2.1, 0.8, 0.2, 3),
+        (0.6, 2.1, 0.3, 0.2, 6),
     ):
         match = dataclasses.replace(
             results[0],
@@ -194,7 +198,11 @@ def test_another_attempt_while_nothing_matches(
             match_probability=probability,
         )
         attempts = itertools.count(1)
-        monkeypatch.setattr(attempts_module, "attempt", lambda *_: next(attempts) and match)  # noqa: B023
+
+        def attempt(*_, match=match, attempts=attempts, apart=apart):
+            return dataclasses.replace(match, target=match.target + apart * next(attempts))
+
+        monkeypatch.setattr(attempts_module, "attempt", attempt)
         assert vrrt_jax.plan(*args, key=jax.random.key(0), config=config).ok
         assert next(attempts) - 1 == expected
 

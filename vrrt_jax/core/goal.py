@@ -88,6 +88,11 @@ class LeastSquaresGoal(PytreeSubclasses):
         """How far a configuration (D,) is from the goal, ()."""
         raise NotImplementedError(_NEITHER)
 
+    @property
+    def judge(self) -> Any:
+        """The goal whose loss tells whether it is reached, where that is not this one's."""
+        return self
+
     def residual(self, world: Any, q: jax.Array) -> jax.Array:
         """Errors (M,) of a configuration (D,)."""
         raise NotImplementedError(_NEITHER)

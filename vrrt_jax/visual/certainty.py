@@ -9,6 +9,8 @@ import math
 
 import numpy as np
 
+from vrrt_jax.splat.loss import COLOR_WEIGHT, MATCH_COLOR_WEIGHT
+
 LEAST_RATIO = 0.05  # of a loss to its threshold; a lower one says no more
 MOST_AHEAD = 10.0  # how many times worse the best rival is; more says no more
 
@@ -18,43 +20,59 @@ class Weights:
     """Of the log odds that a pose is right."""
 
     constant: float
-    loss: float  # times the log of the loss over its threshold
+    coverage: float  # times the log of the coverage's loss over the threshold
     rival: float  # times the log of the best rival's cost over the pose's
     untold: float  # times the largest uncertainty of a joint [rad] or [m]
 
 
-WEIGHTS = Weights(constant=-2.1, loss=-3.3, rival=4.3, untold=-0.3)
+WEIGHTS = Weights(constant=-2.8, coverage=-3.1, rival=5.2, untold=-1.0)
 
 
 def features(
-    loss: float, threshold: float, cost: np.ndarray, end: int, uncertainty: np.ndarray
+    loss: float,
+    colored_loss: float,
+    threshold: float,
+    cost: np.ndarray,
+    end: int,
+    uncertainty: np.ndarray,
 ) -> tuple[float, float, float]:
     """What the probability of an end depends on.
 
     Args:
         loss: of the end, on the fine image.
+        colored_loss: the same with colors as they count in a search.
         threshold: loss of a match there.
         cost: (n,) of all distinct ends, infinite in collision.
         end: which of them.
         uncertainty: (D,) how far off each joint of the end may be [rad] or [m].
 
     Returns:
-        The log of the loss over its threshold, the log of the best rival's cost over the end's,
-        and the largest uncertainty [rad] or [m].
+        The log of the loss that is left without colors, which no lamp changes, over its threshold;
+        the log of the best rival's cost over the end's, 0 for an end that does not match; and the
+        largest uncertainty [rad] or [m].
     """
+    # Both losses are the coverage's and so many times the colors'.
+    colors = (colored_loss - loss) / (COLOR_WEIGHT - MATCH_COLOR_WEIGHT)
+    coverage = loss - MATCH_COLOR_WEIGHT * colors
     rivals = np.delete(cost, end)
-    ahead = float(np.min(rivals, initial=np.inf)) / float(cost[end])
+    ahead = float(np.min(rivals, initial=np.inf)) / float(cost[end]) if loss <= threshold else 1.0
     return (
-        math.log(max(loss / threshold, LEAST_RATIO)),
+        math.log(max(coverage / threshold, LEAST_RATIO)),
         math.log(float(np.clip(ahead, 1.0 / MOST_AHEAD, MOST_AHEAD))),
         float(np.max(uncertainty)),
     )
 
 
 def match_probability(
-    loss: float, threshold: float, cost: np.ndarray, end: int, uncertainty: np.ndarray
+    loss: float,
+    colored_loss: float,
+    threshold: float,
+    cost: np.ndarray,
+    end: int,
+    uncertainty: np.ndarray,
 ) -> float:
     """The probability that an end is the right pose; arguments are those of :func:`features`."""
-    over, ahead, untold = features(loss, threshold, cost, end, uncertainty)
-    odds = WEIGHTS.constant + WEIGHTS.loss * over + WEIGHTS.rival * ahead + WEIGHTS.untold * untold
+    own = features(loss, colored_loss, threshold, cost, end, uncertainty)
+    weights = WEIGHTS.coverage, WEIGHTS.rival, WEIGHTS.untold
+    odds = WEIGHTS.constant + sum(w * x for w, x in zip(weights, own, strict=True))
     return 1.0 / (1.0 + math.exp(-odds))

@@ -124,7 +124,8 @@ def finish_visual(
         result = dataclasses.replace(result, advice=_untold(robot, uncertainty))
     probability = float("nan")
     if uncertainty is not None and np.isfinite(ends.cost[end]):
-        probability = match_probability(loss, ends.threshold, ends.cost, end, uncertainty)
+        losses = loss, float(ends.colored_loss[end])
+        probability = match_probability(*losses, ends.threshold, ends.cost, end, uncertainty)
     return dataclasses.replace(
         result,
         match_probability=probability,

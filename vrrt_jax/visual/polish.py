@@ -90,6 +90,18 @@ class Polishing:
         """Loss of a match on the fine image."""
         return float(self.fine.goal.threshold)
 
+    @property
+    def as_judged(self) -> "Polishing":
+        """The same, where colors count as little as where it is judged what matches."""
+        close_up = self.close_up
+        if close_up is not None:
+            close_up = dataclasses.replace(close_up, objective=close_up.objective.judge)
+        coarse, fine = (
+            dataclasses.replace(objective, goal=objective.goal.judge)
+            for objective in (self.coarse, self.fine)
+        )
+        return dataclasses.replace(self, coarse=coarse, fine=fine, close_up=close_up)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Polished:
@@ -112,6 +124,7 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
         seed: of the samples.
     """
     config, coarse, fine = polishing.config, polishing.coarse, polishing.fine
+    searched, judged = fine, polishing.as_judged
     rng = np.random.default_rng(seed)
     ends = _search_around(world, polishing, q, rng)
 
@@ -124,6 +137,12 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
     if len(others):
         ends = _distinct_ends(world, _joined(ends, _settled(world, fine, others)), config.kept)
 
+    # In another light than that of training, shading would outweigh what tells poses apart.
+    light_is_strange = ends.loss[0] > polishing.threshold and _matches(world, judged, ends.q[0])
+    if light_is_strange:
+        polishing, fine = judged, judged.fine
+        ends = _distinct_ends(world, _settled(world, fine, ends.q), config.kept)
+
     # Once more the best, where derivatives are those of the minimum.
     ends = ends.take(ends.cost <= RIVALS * ends.cost[0])
     if polishing.close_up is None:
@@ -132,18 +151,22 @@ def polish(world: World, polishing: Polishing, q: np.ndarray, seed: int) -> Poli
         ends = _settled_with_hand(world, polishing, polishing.close_up, ends, rng)
     ends = _freed(world, fine, ends, seed)
     ends = ends.take(np.lexsort([ends.cost, ~ends.free]))
-    judge = getattr(fine.goal, "judge", None)
-    loss = ends.loss
-    if judge is not None:
-        loss = evaluate_each(world, dataclasses.replace(fine, goal=judge), ends.q)[0]
+    loss, colored_loss = evaluate_each(world, judged.fine, ends.q)[0], ends.loss
+    if light_is_strange:
+        colored_loss = evaluate_each(world, searched, ends.q)[0]
     informed = ends.matrix - np.asarray(fine.prior.matrix)
     return Polished(
         q=ends.q,
         loss=loss,
-        colored_loss=ends.loss,
+        colored_loss=colored_loss,
         cost=np.where(ends.free, ends.cost, np.inf),
         uncertainty=joint_uncertainty(informed, polishing.threshold),
     )
+
+
+def _matches(world: World, polishing: Polishing, q: np.ndarray) -> bool:
+    """Whether a configuration (D,) does on the fine image."""
+    return bool(evaluate_each(world, polishing.fine, q[None])[0][0] <= polishing.threshold)
 
 
 def compile_polishing(world: World, polishing: Polishing) -> None:

@@ -88,6 +88,19 @@ def test_polishing_turns_the_wrist_back(panda, self_model, camera, open_world):
     assert not np.isfinite(found.cost).any()  # what matches is in collision
 
 
+def test_in_strange_light_colors_count_less(panda, self_model, camera, open_world):
+    image = picture(panda, self_model, camera, Q_GOAL, level=2)
+    image[..., :3] *= np.linspace(0.1, 1.0, image.shape[1])[:, None]  # a lamp at the side
+    polishing = polishing_of(panda, self_model, camera, image, PlannerConfig())
+    assert float(polishing.as_judged.fine.goal.color_weight) < 0.2 * float(
+        polishing.fine.goal.color_weight
+    )
+    ends = polish(open_world, polishing, Q_GOAL[None], seed=0)
+    assert ends.loss[0] < polishing.threshold < ends.colored_loss[0]
+    assert ends.cost[0] < ends.colored_loss[0]
+    assert np.mean(np.abs(ends.q[0] - Q_GOAL)) < 0.02
+
+
 def test_a_close_up_tells_half_a_turn(panda, self_model, camera, open_world):
     image = picture(panda, self_model, camera, Q_GOAL, level=3)
     polishing = polishing_of(panda, self_model, camera, image, PlannerConfig())
