@@ -170,9 +170,6 @@ def _run_command(arguments: argparse.Namespace) -> int:
     from nrp_jax.samplers import load_sampler
 
     methods = check_names(arguments.task, arguments.methods)
-    for name in ("homes", "queries", "max_expansions", "lanes"):
-        if getattr(arguments, name) < 1:
-            raise ValueError(f"{name} is {getattr(arguments, name)}; expected at least 1")
     robot = load_robot(arguments.task)
     samplers = {
         method: load_sampler(
