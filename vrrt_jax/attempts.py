@@ -27,6 +27,7 @@ from vrrt_jax.scene.world import World, pose_error
 from vrrt_jax.visual import lineages
 from vrrt_jax.visual import policy as published
 from vrrt_jax.visual.finish import finish_visual
+from vrrt_jax.visual.goal import ImageObjective
 from vrrt_jax.visual.least_squares import linearize
 from vrrt_jax.visual.lineages import LineageRRT
 from vrrt_jax.visual.polish import compile_polishing
@@ -38,6 +39,7 @@ CONFIRMING = 2  # more attempts where a match is in doubt, or has no path
 DOUBTFUL = 0.5  # of the threshold; a match with a larger loss is in doubt
 UNLIKELY = 0.5  # probability of a match; one below is looked for again as if it were none
 SAME_POSE = 0.05  # [rad] mean over the joints; two attempts that end as near agree
+AGREEING = 3  # attempts that end at the same pose, which does not match, for it to be named
 STRANGE = 2.0  # thresholds; colors as far off are another lamp's, and not a wrong pose's
 ROOT_SAMPLES, ROOT_BATCHES = 4096, 8  # random configurations, of which some are roots
 
@@ -66,7 +68,7 @@ def plan_by_loss(
             # another lamp, where all are in doubt, if one more ends there too.
             in_doubt = _is_in_doubt(result)
             if result.colored_loss > STRANGE * result.match_threshold:
-                in_doubt &= not _was_found_twice(world, result.target, ends)
+                in_doubt &= _num_ends_at(world, result.target, ends) < 2
             few_more = in_doubt or result.status in (Status.NO_PATH, Status.NOT_VERIFIED)
             goes_on = result.status is Status.NO_MATCH or (few_more and again <= CONFIRMING)
             goes_on |= in_doubt and result.match_probability < UNLIKELY
@@ -88,6 +90,15 @@ def plan_by_loss(
             else:
                 best = other if _is_better(other, result, config.match.ambiguity) else result
             result = with_time_of(best, result, other)
+    num = _num_ends_at(world, result.target, ends)
+    is_image = isinstance(problem.goal, ImageObjective)
+    if is_image and result.status is Status.NO_MATCH and num >= AGREEING:
+        scale = 1.1 * config.match.scale * result.loss / result.match_threshold
+        advice = (
+            f"{num} of {len(ends)} attempts end at the same pose: if it looks right, the picture "
+            f"or its mask is rougher than usual; match.scale={scale:.2g} lets it match"
+        )
+        result = dataclasses.replace(result, advice=advice)
     return result
 
 
@@ -97,9 +108,9 @@ def _is_in_doubt(result: PlanResult) -> bool:
     return result.ok and (result.loss > DOUBTFUL * threshold or result.colored_loss > threshold)
 
 
-def _was_found_twice(world: World, target: np.ndarray, ends: Sequence[np.ndarray]) -> bool:
-    """Whether two attempts ended at a configuration (D,)."""
-    return sum(pose_error(world, end, target).mean() < SAME_POSE for end in ends) > 1
+def _num_ends_at(world: World, target: np.ndarray, ends: Sequence[np.ndarray]) -> int:
+    """How many attempts ended at a configuration (D,)."""
+    return sum(pose_error(world, end, target).mean() < SAME_POSE for end in ends)
 
 
 def _is_better(other: PlanResult, result: PlanResult, ambiguity: float) -> bool:

@@ -178,6 +178,14 @@ def test_another_attempt_while_nothing_matches(
     result = vrrt_jax.plan(*args, key=jax.random.key(0), config=config)
     assert result.status is vrrt_jax.Status.INTERRUPTED and result.loss == results[0].loss
 
+    # Attempts that agree on what does not match say so.
+    rough = dataclasses.replace(results[0], loss=1.24 * results[0].match_threshold)
+    monkeypatch.setattr(attempts_module, "attempt", lambda *_: rough)
+    result = vrrt_jax.plan(*args, key=jax.random.key(0), config=config)
+    assert result.advice.startswith("6 of 6 attempts end at the same pose")
+    scale = float(result.advice.split("match.scale=")[1].split()[0]) / config.match.scale
+    assert 1.24 < scale < 1.5  # so that it would match
+
     # A match in doubt is looked for again, and longer if it is unlikely too; under another lamp
     # until it is found twice.
     threshold = results[0].match_threshold
