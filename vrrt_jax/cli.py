@@ -1,6 +1,7 @@
 """The ``vrrt`` command: plan, view, render, fit, spheres, bench, report, worlds, doctor."""
 
 import argparse
+import ast
 import json
 import sys
 from collections.abc import Sequence
@@ -53,6 +54,13 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--time-limit", type=command.seconds, default=60.0, help="of the search [s]")
     plan.add_argument("--paper", action="store_true", help="the published settings")
     plan.add_argument("--capacity", type=command.whole(8, 1 << 20), help="nodes of the tree")
+    plan.add_argument(
+        "--set",
+        metavar="NAME=VALUE",
+        nargs="+",
+        type=_setting,
+        help="any settings of PlannerConfig, as --set match.scale=1.3 budget.attempts=2",
+    )
     plan.add_argument("--out", default="out", help="folder for the results")
     plan.add_argument(
         "--trajectory", help="also write the path with its times: a .npz, .json, .csv or .yaml file"
@@ -124,6 +132,7 @@ def _plan(arguments: argparse.Namespace) -> int:
     changes: dict[str, Any] = {"budget.time_limit_s": arguments.time_limit}
     if arguments.capacity is not None:
         changes["tree.capacity"] = arguments.capacity
+    changes.update(arguments.set or ())
     make = vrrt_jax.PlannerConfig.paper if arguments.paper else vrrt_jax.PlannerConfig
     config = make().changed(changes)
     check_config(config)
@@ -345,6 +354,16 @@ def _box(text: str) -> list[float]:
     if len(values) != 4:
         raise argparse.ArgumentTypeError(f"'{text}' is not a box such as 80,40,560,470")
     return values.tolist()
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    name, _, value = text.partition("=")
+    try:
+        return name, ast.literal_eval(value)
+    except (ValueError, SyntaxError, RecursionError, MemoryError):
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is not a setting such as match.scale=1.3 or expand.inherit=False"
+        ) from None
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -40,7 +40,7 @@ def test_packaged_problems_are_solved_and_without_time_they_are_not(tmp_path, ca
         out = tmp_path / name
         options = [*fast, "--trajectory", str(out / "trajectory.npz")]
         drawn = name == PROBLEMS[0]
-        options += [] if drawn else ["--no-pictures"]
+        options += ["--set", "match.scale=1.5", "budget.attempts=2"] if drawn else ["--no-pictures"]
         assert cli.main(["plan", "--problem", name, "--out", str(out), *options]) == 0
         result = json.loads((out / "result.json").read_text())
         assert result["status"] == "SOLVED" and result["verified"]
@@ -55,6 +55,7 @@ def test_packaged_problems_are_solved_and_without_time_they_are_not(tmp_path, ca
         obstacles = vrrt_jax.obstacle_list(problem.world)
         assert vrrt_jax.verify_path(problem.robot, obstacles, path, step=0.002).ok
         assert (out / "figure.png").exists() == drawn
+        assert result["config"]["match"]["scale"] == (1.5 if drawn else 1.0)
         if not drawn:
             continue
         with Image.open(out / "figure.png") as figure:
@@ -131,6 +132,15 @@ def test_bad_input_is_one_clear_line_and_writes_nothing(tmp_path, problem_copy, 
     expect("--problem or --self-model", "--problem", folder, "--self-model", "arm.npz")
     expect("--capacity: '0'; expected", "--problem", folder, "--capacity", 0)
     expect("--time-limit: '-1'; expected", "--problem", folder, "--time-limit", -1)
+    for wrong, message in (
+        ("match.scale", "'match.scale' is not a setting such as"),
+        ("match.scale=one", "is not a setting such as"),
+        ("match.scal=1", "unknown setting 'match.scal'; have: match.scale"),
+        ("match.scale=-1", "match.scale=-1 is out of range"),
+        ("budget.attempts=1.5", "budget.attempts=1.5; expected a whole number"),
+        ("match=1", "match=1; expected a MatchConfig"),
+    ):
+        expect(message, "--problem", folder, "--set", wrong)
     outside = [3.0, *fields["start"][1:]]
     expect("joint1' is at 3.0000, its bounds", "--problem", change(start=outside))
     expect("has shape (3,)", "--problem", change(start=fields["start"][:3]))
