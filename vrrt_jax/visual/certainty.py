@@ -28,41 +28,6 @@ class Weights:
 WEIGHTS = Weights(constant=-2.8, coverage=-3.1, rival=5.2, untold=-1.0)
 
 
-def features(
-    loss: float,
-    colored_loss: float,
-    threshold: float,
-    cost: np.ndarray,
-    end: int,
-    uncertainty: np.ndarray,
-) -> tuple[float, float, float]:
-    """What the probability of an end depends on.
-
-    Args:
-        loss: of the end, on the fine image.
-        colored_loss: the same with colors as they count in a search.
-        threshold: loss of a match there.
-        cost: (n,) of all distinct ends, infinite in collision.
-        end: which of them.
-        uncertainty: (D,) how far off each joint of the end may be [rad] or [m].
-
-    Returns:
-        The log of the loss that is left without colors, which no lamp changes, over its threshold;
-        the log of the best rival's cost over the end's, 0 for an end that does not match; and the
-        largest uncertainty [rad] or [m].
-    """
-    # Both losses are the coverage's and so many times the colors'.
-    colors = (colored_loss - loss) / (COLOR_WEIGHT - MATCH_COLOR_WEIGHT)
-    coverage = loss - MATCH_COLOR_WEIGHT * colors
-    rivals = np.delete(cost, end)
-    ahead = float(np.min(rivals, initial=np.inf)) / float(cost[end]) if loss <= threshold else 1.0
-    return (
-        math.log(max(coverage / threshold, LEAST_RATIO)),
-        math.log(float(np.clip(ahead, 1.0 / MOST_AHEAD, MOST_AHEAD))),
-        float(np.max(uncertainty)),
-    )
-
-
 def match_probability(
     loss: float,
     colored_loss: float,
@@ -71,8 +36,28 @@ def match_probability(
     end: int,
     uncertainty: np.ndarray,
 ) -> float:
-    """The probability that an end is the right pose; arguments are those of :func:`features`."""
-    own = features(loss, colored_loss, threshold, cost, end, uncertainty)
-    weights = WEIGHTS.coverage, WEIGHTS.rival, WEIGHTS.untold
-    odds = WEIGHTS.constant + sum(w * x for w, x in zip(weights, own, strict=True))
+    """The probability that an end is the right pose.
+
+    It depends on the loss that is left without colors, which no lamp changes, on the best rival's
+    cost if the end matches, and on the least certain joint.
+
+    Args:
+        loss: of the end, on the fine image.
+        colored_loss: the same with colors as they count in a search.
+        threshold: loss of a match there.
+        cost: (n,) of all distinct ends, infinite in collision.
+        end: which of them.
+        uncertainty: (D,) how far off each joint of the end may be [rad] or [m].
+    """
+    # Both losses are the coverage's and so many times the colors'.
+    colors = (colored_loss - loss) / (COLOR_WEIGHT - MATCH_COLOR_WEIGHT)
+    coverage = loss - MATCH_COLOR_WEIGHT * colors
+    rivals = np.delete(cost, end)
+    ahead = float(np.min(rivals, initial=np.inf)) / float(cost[end]) if loss <= threshold else 1.0
+    odds = (
+        WEIGHTS.constant
+        + WEIGHTS.coverage * math.log(max(coverage / threshold, LEAST_RATIO))
+        + WEIGHTS.rival * math.log(float(np.clip(ahead, 1.0 / MOST_AHEAD, MOST_AHEAD)))
+        + WEIGHTS.untold * float(np.max(uncertainty))
+    )
     return 1.0 / (1.0 + math.exp(-odds))
