@@ -17,10 +17,12 @@ MAX_BORDER = 0.4  # largest share of the border that can be robot
 MAX_COVERED = 0.9  # largest share of an image that can be robot
 MIN_COVERED = 1e-3  # and the least
 SPECK = 1e-4  # share of an image below which a patch, or a hole, is noise
+RIM_PX = 7  # width of what is around a hole, on both sides
+TINT = 0.15  # share of the links' difference that bleeds into the background between them
 COLORFUL = 0.12  # difference of channels from which on a background's color bleeds
 MIN_FAINT = 3e-3  # share of faint pixels from which on a picture has lost something
-BLEED_PX = 4  # how far
-OFF_LINE = 0.35  # how far off the line between two colors their mixtures are, of its length
+BLEED_PX = 3  # how far
+OFF_LINE = 0.5  # how far off the line between two colors their mixtures are, of its length
 FAINT = 2 / 255  # change of color across an outline that is none
 MAX_FAINT = 0.2  # largest share of the robot's outline that can be so
 OWN_COLOR = 0.9  # share of its own color from which on a pixel of the robot is not mended
@@ -52,10 +54,12 @@ def robot_on_plain_background(
     if spread > MAX_SPREAD:
         raise _not_plain(apart > MAX_TOLERANCE)
     is_robot = apart > max(_noise(off, apart), OF_SPREAD * spread)
+    tint = 0.0
     # Without loss nothing bleeds.
     if np.ptp(color) > COLORFUL and np.mean(_is_faint(apart)) > MIN_FAINT:
         image, is_robot = _without_bleeding(image, color, apart, is_robot)
-    is_robot = without_specks(is_robot, apart, spread)
+        tint = TINT
+    is_robot = without_specks(is_robot, apart, spread, tint)
     _check_covered(is_robot, valid)
     _check_outline(is_robot & valid, apart)
     return image, is_robot.astype(np.float32)
@@ -115,18 +119,24 @@ def _without_bleeding(
     return np.where(is_mended[..., None], own + color, image), is_robot
 
 
-def without_specks(is_robot: np.ndarray, apart: np.ndarray, spread: float) -> np.ndarray:
+def without_specks(
+    is_robot: np.ndarray, apart: np.ndarray, spread: float, tint: float = 0.0
+) -> np.ndarray:
     """What is robot (H, W), without specks, and without holes that are not background.
 
     A hole is small, or most of it differs from the background's color: there the robot's shading
-    passes through that color.
+    passes through that color. But what differs less than by ``tint`` times what is around it is
+    background between two links that has taken on some of their color.
     """
     speck = SPECK * is_robot.size
     holes, num = _patches(~is_robot)
     index = np.arange(num + 1)
     size = np.bincount(holes.ravel(), minlength=num + 1)
     typical = np.asarray(ndimage.median(apart, holes, index))
-    is_filled = (size <= speck) | (typical > max(MIN_TOLERANCE, OF_SPREAD * spread))
+    rim = ndimage.maximum_filter(holes, RIM_PX) * is_robot  # the hole that is near, if any
+    around = np.asarray(ndimage.median(apart, rim, index))
+    is_robot_color = (typical > max(MIN_TOLERANCE, OF_SPREAD * spread)) & (typical > tint * around)
+    is_filled = (size <= speck) | is_robot_color
     is_filled[np.unique(_border(holes))] = False  # open to the outside
     is_filled[0] = False  # the robot
     is_robot = is_robot | is_filled[holes]

@@ -51,6 +51,21 @@ def test_the_robot_is_told_from_any_color(goal, name):
     assert share_wrong(goal, as_jpeg(pixels, 75)) < 0.05
 
 
+@pytest.mark.parametrize("color", ["green", "blue", (0.8, 0.2, 0.6)])
+def test_what_shows_between_links_stays_background(color):
+    # A ring of two grays, whose color bleeds into all of its hole.
+    y, x = np.mgrid[:160, :160] - 80.0
+    radius = np.hypot(x, y)
+    ring = (radius > 12) & (radius < 40)
+    image = np.broadcast_to(np.asarray(COLORS.get(color, color), np.float32), (160, 160, 3)).copy()
+    image[ring] = np.where(x > 0, 0.9, 0.2)[ring][:, None]
+    pixels = np.round(255 * image).astype(np.uint8)
+    for quality in (90, 60):
+        _, alpha = robot_on_plain_background(as_jpeg(pixels, quality).astype(np.float32) / 255)
+        assert alpha[radius < 10].mean() < 0.02
+        assert np.abs(alpha - ring).mean() < 0.03 * ring.mean()
+
+
 @pytest.mark.parametrize("color", [(0.05, 0.2, 0.05), (0.05, 0.05, 0.2), (0.25, 0.18, 0.1)])
 def test_dark_colors_do_not_bleed_either(goal, color):
     pixels = on_color(goal, color)
