@@ -23,6 +23,8 @@ MIN_PX = 16  # of an image, on each side
 MIN_OPAQUE = 0.99  # a fourth channel that is nowhere lower is no mask
 MIN_VALID = 0.75  # share of a shrunk pixel that has to be valid for its mean to stand for it
 MIN_SEEN = 0.1  # share of the robot that masks have to leave
+OUTLINE_PX = 0.7  # how far off the outline of a mask of 0 and 1 is, told from a photograph
+SOFT = 0.1  # share of the outline's pixels from which on a mask has more than 0 and 1
 MIN_AROUND = 0.01  # share of what they leave that has to be background
 
 
@@ -34,6 +36,7 @@ class View:
     alpha: np.ndarray  # (H, W) share of the pixel that the robot covers, 0 where not valid
     valid: np.ndarray  # (H, W) 1 where the pixel is compared, else 0
     camera: Camera
+    is_hard: bool = False  # whether alpha was 0 or 1 nearly everywhere, before pixels were squared
 
 
 def check_views(
@@ -74,10 +77,17 @@ def check_views(
         rgb, alpha = _robot_of(pixels, valid)
         alphas.append(alpha.ravel())
         valids.append(valid.ravel())
+        is_hard = _is_hard(alpha, valid)
         planes = np.concatenate([rgb, alpha[..., None], np.ones_like(alpha)[..., None]], axis=-1)
         planes, camera = _square_pixels(planes * valid[..., None], camera)
         views.append(
-            View(rgb=planes[..., :3], alpha=planes[..., 3], valid=planes[..., 4], camera=camera)
+            View(
+                rgb=planes[..., :3],
+                alpha=planes[..., 3],
+                valid=planes[..., 4],
+                camera=camera,
+                is_hard=is_hard,
+            )
         )
     _check_masks(np.concatenate(alphas), np.concatenate(valids))
     shapes = {view.alpha.shape for view in views}
@@ -100,7 +110,7 @@ def shrink_views(views: Sequence[View], image_px: int) -> tuple[GoalImage, Camer
     goals, cameras = [], []
     for view in views:
         # The mean of a block is over its valid pixels alone.
-        factor = max(1, round(view.camera.height / image_px))
+        factor = _factor(view, image_px)
         share = _block_means(view.valid, factor)
         known = np.maximum(share, 1e-6)
         goals.append(
@@ -112,6 +122,42 @@ def shrink_views(views: Sequence[View], image_px: int) -> tuple[GoalImage, Camer
         )
         cameras.append(shrunk(view.camera, factor))
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *goals), stack_cameras(cameras)
+
+
+def _factor(view: View, image_px: int) -> int:
+    return max(1, round(view.camera.height / image_px))
+
+
+def outline_error_px(views: Sequence[View], image_px: int) -> float:
+    """How far off the robot's outline may be in the views shrunk to a height [px].
+
+    It is 0 for the soft masks of renders. A mask of 0 and 1, as one tells or paints it on a
+    photograph, is off by up to :data:`OUTLINE_PX` of the photograph's own pixels.
+    """
+    errors = [OUTLINE_PX / _factor(view, image_px) for view in views if view.is_hard]
+    return max(errors, default=0.0)
+
+
+def _is_hard(alpha: np.ndarray, valid: np.ndarray) -> bool:
+    """Whether a mask (H, W) has hardly any pixels between 0 and 1 along its outline."""
+    is_soft = (alpha > 0.02) & (alpha < 0.98) & (valid > 0)
+    return bool(np.sum(is_soft) < SOFT * _outline(alpha, valid))
+
+
+def _outline(alpha: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """The length (...) of the outline of masks (..., H, W) [px], where they are valid."""
+    known = valid > 0
+    across = np.abs(np.diff(alpha, axis=-1)) * (known[..., 1:] & known[..., :-1])
+    down = np.abs(np.diff(alpha, axis=-2)) * (known[..., 1:, :] & known[..., :-1, :])
+    # Of steps along the axes, in the mean over directions.
+    return np.pi / 4 * (np.sum(across, axis=(-2, -1)) + np.sum(down, axis=(-2, -1)))
+
+
+def mask_loss(goal: GoalImage, error_px: float) -> float:
+    """The loss of a right pose where the goal's outline is off by so many of its pixels."""
+    valid = np.asarray(goal.valid)
+    of_view = _outline(np.asarray(goal.alpha), valid) / np.maximum(valid.sum(axis=(1, 2)), 1.0)
+    return error_px**2 * float(np.mean(of_view)) / 4
 
 
 def prepare_goal(

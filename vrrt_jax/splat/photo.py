@@ -24,7 +24,9 @@ _MOST_OF_RIM = 0.75  # white in a robot's mask; more is an inverted one
 class Photo:
     """What an :class:`~vrrt_jax.ImageGoal` needs of a photograph, without distortion."""
 
-    image: np.ndarray  # (H, W, 3), or (H, W, 4) with the robot's mask, float32 in [0, 1]
+    # (H, W, 3), or (H, W, 4) with the robot's mask, of 0 and 1 unless it is the image's own fourth
+    # channel; float32 in [0, 1]
+    image: np.ndarray
     camera: Camera
     mask: np.ndarray | None  # (H, W) bool: the pixels that are known; None if all are
 
@@ -77,6 +79,9 @@ def load_photo(
     if lens is not None:
         straight, known = lens.undistort(np.concatenate([pixels, seen[..., None]], axis=-1))
         pixels, seen = straight[..., :-1], known & (straight[..., -1] > KNOWN)
+    if any(option is not None for option in (robot_mask, background, box)):
+        # It was told, not rendered: no pixel's share is known.
+        pixels[..., 3] = np.round(pixels[..., 3])
     seen = seen > 0
     return Photo(image=pixels, camera=pinhole, mask=None if seen.all() else seen)
 

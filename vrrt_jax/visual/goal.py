@@ -13,7 +13,13 @@ from vrrt_jax.core.goal import LeastSquaresGoal
 from vrrt_jax.core.types import pytree, static
 from vrrt_jax.robots.kinematics import batch_link_poses
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.splat.images import View, check_views, shrink_views
+from vrrt_jax.splat.images import (
+    View,
+    check_views,
+    mask_loss,
+    outline_error_px,
+    shrink_views,
+)
 from vrrt_jax.splat.loss import (
     COLOR_WEIGHT,
     MATCH_COLOR_WEIGHT,
@@ -75,6 +81,7 @@ class CloseUp:
     objective: ImageObjective  # of the whole images; its threshold is not used
     px: int  # height and width of the part
     threshold: float  # loss of a match, in units of the part's covered share
+    outline_error_px: float  # how far off the robot's outline may be beyond that [px]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,12 +147,14 @@ class ImageGoal:
         splats, windows = _windowed(robot, level.splats, shrunk_cameras)
         # The calibrated threshold is in units of the share of the image that the robot covers.
         covered = float(jnp.sum(image.valid * image.alpha) / jnp.sum(image.valid))
+        expected = level.match_threshold * covered
+        expected += mask_loss(image, outline_error_px(self.checked, image_px))
         return self.objective(
             splats=splats,
             windows=windows,
             cameras=shrunk_cameras,
             image=image,
-            threshold=match_scale * level.match_threshold * covered,
+            threshold=match_scale * expected,
             color_weight=jnp.float32(COLOR_WEIGHT),
             blocks=blocks,
         )
@@ -170,7 +179,10 @@ class ImageGoal:
             color_weight=jnp.float32(COLOR_WEIGHT),
         )
         return CloseUp(
-            objective=objective, px=level.size_px, threshold=match_scale * level.match_threshold
+            objective=objective,
+            px=level.size_px,
+            threshold=match_scale * level.match_threshold,
+            outline_error_px=np.sqrt(match_scale) * outline_error_px(self.checked, image_px),
         )
 
 

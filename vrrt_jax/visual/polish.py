@@ -22,7 +22,7 @@ from vrrt_jax.core.edges import enforce_bounds
 from vrrt_jax.robots.kinematics import link_poses
 from vrrt_jax.scene.world import World, batch_is_free
 from vrrt_jax.splat.camera import project
-from vrrt_jax.splat.images import cut_goal
+from vrrt_jax.splat.images import cut_goal, mask_loss
 from vrrt_jax.splat.types import Camera, SplatModel
 from vrrt_jax.visual.distinct import distances_to, distinct
 from vrrt_jax.visual.goal import CloseUp
@@ -370,7 +370,8 @@ def _hand_goal(
     covered = float(np.mean(image.valid * image.alpha)) / known
     goal = dataclasses.replace(whole, image=image, cameras=cameras)
     objective = dataclasses.replace(fine, goal=goal)
-    return objective, close_up.threshold * max(covered, LEAST_COVERED) / known
+    threshold = close_up.threshold * max(covered, LEAST_COVERED) / known
+    return objective, threshold + mask_loss(image, close_up.outline_error_px)
 
 
 @host_jit

@@ -6,7 +6,15 @@ from PIL import Image
 
 import vrrt_jax
 from vrrt_jax.splat.camera import project, shrunk
-from vrrt_jax.splat.images import cut_goal, prepare_goal
+from vrrt_jax.splat.images import (
+    OUTLINE_PX,
+    check_views,
+    cut_goal,
+    mask_loss,
+    outline_error_px,
+    prepare_goal,
+    shrink_views,
+)
 
 
 @pytest.fixture
@@ -180,3 +188,56 @@ def test_a_folder_of_the_same_name_does_not_hide_a_problem(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     (tmp_path / "panda_posts").mkdir()
     assert vrrt_jax.load_problem("panda_posts").robot.name == "panda"
+
+
+def disc(radius, size):
+    """A soft disc (size, size), whose pixels are the shares that it covers."""
+    fine = 8 * size
+    y, x = (np.mgrid[:fine, :fine] + 0.5) / 8 - size / 2
+    return (np.hypot(x, y) < radius).reshape(size, 8, size, 8).mean(axis=(1, 3)).astype(np.float32)
+
+
+def square(size):
+    return vrrt_jax.look_at((2, 0, 1), (0, 0, 0.3), height=size, width=size)
+
+
+def test_an_outline_that_is_off_has_the_loss_that_is_expected():
+    size, camera = 60, square(60)
+    true, larger = disc(0.25 * size, size), disc(0.25 * size + 0.5, size)
+    goal, _ = prepare_goal([np.dstack([true] * 4)], [camera], size)
+    loss = np.mean((true - larger) ** 2) / 4
+    assert mask_loss(goal, 0.5) == pytest.approx(loss, rel=0.3)
+    assert mask_loss(goal, 0.0) == 0
+
+
+def test_only_masks_of_0_and_1_are_known_to_be_rough():
+    size, camera = 60, square(60)
+    soft = disc(0.25 * size, size)
+    hard = np.round(soft)
+    for alpha, error in ((soft, 0.0), (hard, OUTLINE_PX)):
+        views = check_views([np.dstack([alpha] * 4)], [camera])
+        assert outline_error_px(views, size) == error
+        assert outline_error_px(views, size // 4) == pytest.approx(error / 4)
+        # On a smaller image the same error is a smaller one.
+        losses = [
+            mask_loss(shrink_views(views, px)[0], outline_error_px(views, px))
+            for px in (size, size // 4)
+        ]
+        assert losses[1] == pytest.approx(losses[0] / 4, rel=0.3)
+
+
+def test_a_mask_of_0_and_1_raises_thresholds(panda):
+    problem = vrrt_jax.load_problem("panda_posts", engine="closed_form")
+    given, view = problem.goal_images[0], problem.cameras[0]
+    hard = given.copy()
+    hard[..., 3] = np.round(given[..., 3])
+    of_soft, of_hard = (
+        vrrt_jax.ImageGoal(problem.self_model, view, image) for image in (given, hard)
+    )
+    # On images of 120 px about as much as the self-model's own errors, on smaller ones less.
+    ratios = [
+        float(of_hard.at(panda, px).threshold / of_soft.at(panda, px).threshold) for px in (120, 40)
+    ]
+    assert 1.3 < ratios[0] < 2.5 and 1.02 < ratios[1] < ratios[0]
+    close_up, soft_close_up = of_hard.close_up(480), of_soft.close_up(480)
+    assert close_up.outline_error_px == OUTLINE_PX and soft_close_up.outline_error_px == 0
