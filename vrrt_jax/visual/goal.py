@@ -148,7 +148,8 @@ class ImageGoal:
         # The calibrated threshold is in units of the share of the image that the robot covers.
         covered = float(jnp.sum(image.valid * image.alpha) / jnp.sum(image.valid))
         expected = level.match_threshold * covered
-        expected += mask_loss(image, outline_error_px(self.checked, image_px))
+        # At most as much again: a ragged mask or a tiny picture must not let everything match.
+        expected += min(expected, mask_loss(image, outline_error_px(self.checked, image_px)))
         return self.objective(
             splats=splats,
             windows=windows,

@@ -241,3 +241,14 @@ def test_a_mask_of_0_and_1_raises_thresholds(panda):
     assert 1.3 < ratios[0] < 2.5 and 1.02 < ratios[1] < ratios[0]
     close_up, soft_close_up = of_hard.close_up(480), of_soft.close_up(480)
     assert close_up.outline_error_px == OUTLINE_PX and soft_close_up.outline_error_px == 0
+
+
+def test_a_ragged_mask_does_not_let_everything_match(panda, rng):
+    problem = vrrt_jax.load_problem("panda_posts", engine="closed_form")
+    given, view = problem.goal_images[0], problem.cameras[0]
+    ragged = given.copy()
+    ragged[..., 3] = np.round(given[..., 3]) * (rng.random(given.shape[:2]) < 0.5)
+    goal = vrrt_jax.ImageGoal(problem.self_model, view, ragged).at(panda, 120)
+    covered = float(goal.image.alpha.mean())
+    calibrated = problem.self_model.level_for(120).match_threshold * covered
+    assert float(goal.threshold) <= 2 * calibrated * (1 + 1e-5)
