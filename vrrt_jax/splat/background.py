@@ -133,9 +133,11 @@ def without_specks(
     index = np.arange(num + 1)
     size = np.bincount(holes.ravel(), minlength=num + 1)
     typical = np.asarray(ndimage.median(apart, holes, index))
-    rim = ndimage.maximum_filter(holes, RIM_PX) * is_robot  # the hole that is near, if any
-    around = np.nan_to_num(np.asarray(ndimage.median(apart, rim, index)))
-    is_robot_color = (typical > max(MIN_TOLERANCE, OF_SPREAD * spread)) & (typical > tint * around)
+    is_robot_color = typical > max(MIN_TOLERANCE, OF_SPREAD * spread)
+    if tint:
+        rim = ndimage.maximum_filter(holes, RIM_PX) * is_robot  # the hole that is near, if any
+        around = np.nan_to_num(np.asarray(ndimage.median(apart, rim, index)))
+        is_robot_color &= typical > tint * around
     is_filled = (size <= speck) | is_robot_color
     is_filled[np.unique(_border(holes))] = False  # open to the outside
     is_filled[0] = False  # the robot

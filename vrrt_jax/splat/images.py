@@ -23,9 +23,9 @@ MIN_PX = 16  # of an image, on each side
 MIN_OPAQUE = 0.99  # a fourth channel that is nowhere lower is no mask
 MIN_VALID = 0.75  # share of a shrunk pixel that has to be valid for its mean to stand for it
 MIN_SEEN = 0.1  # share of the robot that masks have to leave
+MIN_AROUND = 0.01  # share of what they leave that has to be background
 OUTLINE_PX = 0.7  # how far off the outline of a mask of 0 and 1 is, told from a photograph
 SOFT = 0.1  # share of the outline's pixels from which on a mask has more than 0 and 1
-MIN_AROUND = 0.01  # share of what they leave that has to be background
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -155,6 +155,8 @@ def _outline(alpha: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 def mask_loss(goal: GoalImage, error_px: float) -> float:
     """The loss of a right pose where the goal's outline is off by so many of its pixels."""
+    if not error_px:
+        return 0.0
     valid = np.asarray(goal.valid)
     of_view = _outline(np.asarray(goal.alpha), valid) / np.maximum(valid.sum(axis=(1, 2)), 1.0)
     return error_px**2 * float(np.mean(of_view)) / 4

@@ -13,13 +13,7 @@ from vrrt_jax.core.goal import LeastSquaresGoal
 from vrrt_jax.core.types import pytree, static
 from vrrt_jax.robots.kinematics import batch_link_poses
 from vrrt_jax.robots.robot import Robot
-from vrrt_jax.splat.images import (
-    View,
-    check_views,
-    mask_loss,
-    outline_error_px,
-    shrink_views,
-)
+from vrrt_jax.splat.images import View, check_views, mask_loss, outline_error_px, shrink_views
 from vrrt_jax.splat.loss import (
     COLOR_WEIGHT,
     MATCH_COLOR_WEIGHT,
@@ -80,8 +74,9 @@ class CloseUp:
 
     objective: ImageObjective  # of the whole images; its threshold is not used
     px: int  # height and width of the part
-    threshold: float  # loss of a match, in units of the part's covered share
+    threshold: float  # calibrated loss of a match, in units of the part's covered share
     outline_error_px: float  # how far off the robot's outline may be beyond that [px]
+    match_scale: float  # of both
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,8 +177,9 @@ class ImageGoal:
         return CloseUp(
             objective=objective,
             px=level.size_px,
-            threshold=match_scale * level.match_threshold,
-            outline_error_px=np.sqrt(match_scale) * outline_error_px(self.checked, image_px),
+            threshold=level.match_threshold,
+            outline_error_px=outline_error_px(self.checked, image_px),
+            match_scale=match_scale,
         )
 
 

@@ -370,8 +370,9 @@ def _hand_goal(
     covered = float(np.mean(image.valid * image.alpha)) / known
     goal = dataclasses.replace(whole, image=image, cameras=cameras)
     objective = dataclasses.replace(fine, goal=goal)
-    threshold = close_up.threshold * max(covered, LEAST_COVERED) / known
-    return objective, threshold + mask_loss(image, close_up.outline_error_px)
+    expected = close_up.threshold * max(covered, LEAST_COVERED) / known
+    expected += mask_loss(image, close_up.outline_error_px)
+    return objective, close_up.match_scale * expected
 
 
 @host_jit

@@ -72,9 +72,9 @@ def test_workers_of_a_cluster_come_and_go(cluster, tmp_path):
     work = partial(_work_to_be_killed, str(log))
     for result in in_workers(work, ITEMS, 1, cluster.address):
         results.append(result)
-        killed_now = [worker for item, worker in _begun(log) if item == KILLED]
-        if killed is None and killed_now:
-            killed = killed_now[0]
+        begun = dict(_begun(log))
+        if killed is None and KILLED in begun:
+            killed = begun[KILLED]
             os.kill(killed, signal.SIGKILL)
             cluster.add_node(num_cpus=1)
             cluster.remove_node(min(cluster.worker_nodes, key=id), allow_graceful=False)
