@@ -87,7 +87,10 @@ def interrupt(code, tmp_path, after=0.0):
         start_new_session=True,
     )
     try:
-        assert run.stdout is not None and run.stdout.readline() == "working\n"
+        assert run.stdout is not None and run.stderr is not None
+        first = run.stdout.readline()
+        # A command that came to an end instead says why.
+        assert first == "working\n", first or run.stderr.read()
         time.sleep(after)
         began = time.monotonic()
         os.killpg(run.pid, signal.SIGINT)
